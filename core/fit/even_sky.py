@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Finds the sky about a far light, such as the sun in an even sky. `far_layer` calls it.
+"""Segments the sky about a far light, such as the sun in an even sky, by seeded region growing. `far_layer` calls it.
 
 An even sky has no contrast, so a sphere sweep cannot tell it from a white wall. A far light can: where a view shows it,
-nothing near stands before it. So the smooth bright region of the picture around it is sky, in each view that shows the
-light. In the other views, a smooth region is sky if it has the sky's colours in the sky's directions. Without a far
-light, nothing is sky: a plain wall indoors never is.
+nothing near stands before it. So the pixels about it are a seed: the smooth bright region that they belong to is sky,
+in each view that shows the light. The sky is propagated to the other views: there, a smooth region is sky if it has the
+sky's colours in the sky's directions. Without a far light, nothing is sky: a plain wall indoors never is.
 """
 from __future__ import annotations
 
@@ -23,19 +23,21 @@ from .sweep_views import (
     Values,
     camera_centre,
     camera_spread,
+    farthest_distance,
     nearest_indices,
+    pixel_indices,
     project_sphere,
     visible_directions,
 )
 
 MAX_LIGHT_PARALLAX_PX = 2.0
 """Largest parallax of a far light over the spread of the cameras, pixels of the sweep's pictures."""
-MIN_LIGHT_DISTANCE, FARTHEST_QUANTILE = 3.0, 0.99
+MIN_LIGHT_DISTANCE = 3.0
 """Smallest distance of a far light relative to that of the farthest points: in a small room, cameras close together
 show no parallax of a lamp either."""
 SEED_RADIUS, MIN_SEED_PX, MIN_SMOOTH_SHARE, MIN_SEED_SHARE = 0.03, 6, 0.5, 0.3
-"""Radius of the surroundings of a far light, in frame widths, and how many of their pixels the frame must hold. If the
-view shows the light, the first share of these is smooth and bright, and a region that covers the second share is sky. A
+"""Radius of the seed about a far light, in frame widths, and how many of its pixels the frame must hold. If the view
+shows the light, the first share of these is smooth and bright, and a region that covers the second share is sky. A
 smaller region may be a wall beside the light."""
 MAX_STEP = 0.04
 """Largest difference of neighbouring pixels of a smooth region, display values of any channel."""
@@ -75,34 +77,34 @@ class Sky:
         return self.is_sky[nearest_indices(directions, self.directions)]
 
 
-def far_lights(lights: Floats, points: Values, cameras: list[Camera]) -> Floats:
+def select_far_lights(lights: Floats, points: Values, cameras: list[Camera]) -> Floats:
     """Return which lights (m, 3) are so far that they show no parallax and lie behind all the scene, world units.
 
     lights: (n, 3), places of static lights. points: (k, 3), those of the solve. cameras: those of the sweep.
     """
     centre = camera_centre(cameras)
     focal = max(camera.focal_length for camera in cameras)
-    farthest = float(np.quantile(np.linalg.norm(points - centre, axis=1), FARTHEST_QUANTILE))
-    min_distance = max(focal * camera_spread(cameras) / MAX_LIGHT_PARALLAX_PX, MIN_LIGHT_DISTANCE * farthest)
+    min_distance = max(focal * camera_spread(cameras) / MAX_LIGHT_PARALLAX_PX,
+                       MIN_LIGHT_DISTANCE * farthest_distance(points, cameras))
     return lights[np.linalg.norm(lights - centre, axis=1) >= min_distance]
 
 
-def find_even_sky(views: Sequence[SweepView], lights: Floats, points: Values, pitch: float) -> Sky | None:
+def segment_sky(views: Sequence[SweepView], lights: Floats, points: Values, pitch: float) -> Sky | None:
     """Return the sky about far lights (m, 3), world units; None if no view shows a light in an even sky.
 
     points: (k, 3), those of the solve. pitch: distance of neighbouring directions, radians.
     """
-    surroundings = [_light_surroundings(view, lights) for view in views]
-    brightest = max((around.level for view_surroundings in surroundings for around in view_surroundings), default=0.0)
+    seeds = [_light_seeds(view, lights) for view in views]
+    brightest = max((seed.level for view_seeds in seeds for seed in view_seeds), default=0.0)
     if brightest < MIN_LEVEL:
         return None
-    regions = [_smooth_regions(view, points, MIN_SKY_LEVEL * brightest) for view in views]
-    masks = [_regions_about(view_surroundings, view_regions, MIN_SEED_LEVEL * brightest)
-             for view_surroundings, view_regions in zip(surroundings, regions, strict=True)]
-    directions = visible_directions([widened(view.camera) for view in views], pitch)
+    regions = [_segment_smooth_regions(view, points, MIN_SKY_LEVEL * brightest) for view in views]
+    masks = [_seeded_regions(view_seeds, view_regions, MIN_SEED_LEVEL * brightest)
+             for view_seeds, view_regions in zip(seeds, regions, strict=True)]
+    directions = visible_directions([with_margin(view.camera) for view in views], pitch)
     samples = [_Samples.of(view, view_regions, directions) for view, view_regions in zip(views, regions, strict=True)]
-    _spread_to_other_views(masks, regions, samples)
-    closed = [_close(mask) for mask in masks]
+    _propagate_to_views(masks, regions, samples)
+    closed = [_close_mask(mask) for mask in masks]
     sky_counts, view_counts = np.zeros(len(directions)), np.zeros(len(directions))
     for mask, view_samples in zip(closed, samples, strict=True):
         view_counts[view_samples.rows] += 1
@@ -112,10 +114,10 @@ def find_even_sky(views: Sequence[SweepView], lights: Floats, points: Values, pi
     if is_sky.sum() < MIN_SKY_SHARE * in_view.sum():
         return None
     width = float(np.median([view.camera.width / view.camera.focal_length for view in views]))
-    return Sky(directions, _fill_gaps(directions, is_sky, in_view, width), closed)
+    return Sky(directions, _close_directions(directions, is_sky, in_view, width), closed)
 
 
-class _Surroundings(NamedTuple):
+class _Seed(NamedTuple):
     """The pixels (height, width) about a light in a view, and their median brightness, display values of the largest
     channel."""
 
@@ -138,7 +140,7 @@ class _Samples:
     def of(cls, view: SweepView, regions: NDArray[np.int32], directions: Floats) -> _Samples:
         """Sample a view and its regions (height, width) in directions (n, 3), at infinity."""
         inside, places = project_sphere(view.camera, view.camera.position, directions, 0.0)
-        x, y = np.minimum(places.astype(int), np.array(view.camera.size) - 1).T
+        x, y = pixel_indices(places, view.camera.size)
         rows = np.flatnonzero(inside)
         if view.counts is not None:
             counts = view.counts[y, x]
@@ -150,35 +152,34 @@ class _Samples:
         return mask[self.y, self.x]
 
 
-def _light_surroundings(view: SweepView, lights: Floats) -> list[_Surroundings]:
-    """Return the surroundings of those of the lights (m, 3) that are in the frame, none hidden by a mask."""
-    camera, surroundings = view.camera, []
+def _light_seeds(view: SweepView, lights: Floats) -> list[_Seed]:
+    """Return the seeds about those of the lights (m, 3) that are in the frame, none hidden by a mask."""
+    camera, seeds = view.camera, []
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     for (light_x, light_y), depth in zip(*camera.project(lights), strict=True):
         pixels = np.hypot(x - light_x, y - light_y) <= SEED_RADIUS * camera.width
         if view.counts is not None:
             pixels &= view.counts
         if depth > 0 and pixels.sum() >= MIN_SEED_PX:
-            surroundings.append(_Surroundings(pixels, float(np.median(view.picture.max(-1)[pixels]))))
-    return surroundings
+            seeds.append(_Seed(pixels, float(np.median(view.picture.max(-1)[pixels]))))
+    return seeds
 
 
-def _regions_about(surroundings: Sequence[_Surroundings], regions: NDArray[np.int32], min_level: float) -> Booleans:
-    """Return the pixels (height, width) of the regions that cover much of the surroundings of a light which the view
-    shows.
+def _seeded_regions(seeds: Sequence[_Seed], regions: NDArray[np.int32], min_level: float) -> Booleans:
+    """Return the pixels (height, width) of the regions that cover much of the seed about a light which the view shows.
 
     min_level: smallest brightness about such a light, display values.
     """
     sky: list[int] = []
-    for around in surroundings:
-        numbers, counts = np.unique(regions[around.pixels], return_counts=True)
-        shares = np.where(numbers > 0, counts / around.pixels.sum(), 0)
-        if around.level >= min_level and shares.sum() >= MIN_SMOOTH_SHARE:
+    for seed in seeds:
+        numbers, counts = np.unique(regions[seed.pixels], return_counts=True)
+        shares = np.where(numbers > 0, counts / seed.pixels.sum(), 0)
+        if seed.level >= min_level and shares.sum() >= MIN_SMOOTH_SHARE:
             sky.extend(numbers[shares >= MIN_SEED_SHARE].tolist())
     return np.isin(regions, sky)
 
 
-def _smooth_regions(view: SweepView, points: Values, level: float) -> NDArray[np.int32]:
+def _segment_smooth_regions(view: SweepView, points: Values, level: float) -> NDArray[np.int32]:
     """Return the number (height, width) of the smooth region that each pixel belongs to, 0 for none.
 
     level: smallest brightness, display values. Regions with points (k, 3) of the solve are left out.
@@ -196,8 +197,7 @@ def _smooth_regions(view: SweepView, points: Values, level: float) -> NDArray[np
         is_smooth &= view.counts
     count, regions = cv2.connectedComponents(is_smooth.astype(np.uint8), connectivity=4)
     pixels, depth = view.camera.project(points)
-    inside = pixels[view.camera.contains(pixels, depth)].astype(int)
-    x, y = np.minimum(inside, np.array(view.camera.size) - 1).T  # the frame contains its right and lower edge
+    x, y = pixel_indices(pixels[view.camera.contains(pixels, depth)], view.camera.size)
     has_point = np.zeros(regions.shape, bool)
     has_point[y, x] = True
     sizes = np.bincount(regions.ravel(), minlength=count)
@@ -205,7 +205,7 @@ def _smooth_regions(view: SweepView, points: Values, level: float) -> NDArray[np
     return np.where(is_surface[regions], 0, regions)
 
 
-def _spread_to_other_views(masks: list[Booleans], regions: list[NDArray[np.int32]], samples: list[_Samples]) -> None:
+def _propagate_to_views(masks: list[Booleans], regions: list[NDArray[np.int32]], samples: list[_Samples]) -> None:
     """Add to the masks (height, width) the regions that have the sky's colours in the sky's directions, until none is
     added."""
     count = max(int(view_samples.rows.max(initial=0)) for view_samples in samples) + 1
@@ -220,12 +220,12 @@ def _spread_to_other_views(masks: list[Booleans], regions: list[NDArray[np.int32
         sky_colours[known] = np.nanmedian(colours[:, known], axis=0)
         has_changed = False
         for index, (mask, view_regions, view_samples) in enumerate(zip(masks, regions, samples, strict=True)):
-            added = np.isin(view_regions, _sky_regions(view_samples, known, sky_colours)) & ~mask
+            added = np.isin(view_regions, _matching_regions(view_samples, known, sky_colours)) & ~mask
             if added.any():
                 masks[index], has_changed = mask | added, True
 
 
-def _sky_regions(samples: _Samples, known: Booleans, sky_colours: Values) -> list[int]:
+def _matching_regions(samples: _Samples, known: Booleans, sky_colours: Values) -> list[int]:
     """Return the numbers of the regions of a view that are sky, by the known sky (n,) and its colours (n, 3)."""
     is_known = known[samples.rows]
     differences = np.abs(samples.colours - sky_colours[samples.rows]).max(-1)
@@ -238,13 +238,13 @@ def _sky_regions(samples: _Samples, known: Booleans, sky_colours: Values) -> lis
     return accepted
 
 
-def widened(camera: Camera) -> Camera:
+def with_margin(camera: Camera) -> Camera:
     """Return a camera that sees REACH frame widths more on each side."""
     margin = round(REACH * camera.width)
     return camera.cropped(-margin, -margin, camera.width + 2 * margin, camera.height + 2 * margin)
 
 
-def _fill_gaps(directions: Floats, is_sky: Booleans, in_view: Booleans, width: float) -> Booleans:
+def _close_directions(directions: Floats, is_sky: Booleans, in_view: Booleans, width: float) -> Booleans:
     """Return the sky (n,) with its gaps filled: a morphological closing, whose erosion is smaller than its dilation.
 
     in_view: (n,), False for directions beyond all frames, which bound no gap. width: of the frames, radians.
@@ -265,7 +265,7 @@ def _angles_to(directions: Floats, others: Floats) -> Floats:
     return np.asarray(2 * np.arcsin(np.linalg.norm(directions - nearest, axis=1).clip(max=2) / 2))
 
 
-def _close(mask: Booleans) -> Booleans:
+def _close_mask(mask: Booleans) -> Booleans:
     """Return a mask (height, width) with its small holes closed."""
     import cv2
 

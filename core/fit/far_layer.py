@@ -23,7 +23,7 @@ from ..colour.srgb_torch import expose
 from ..gaussians.far_sphere import FarSphere
 from ..gaussians.scene import INITIAL_OPACITY, SceneGaussians
 from ..images.picture import Picture
-from .even_sky import Sky, far_lights, find_even_sky, widened
+from .even_sky import Sky, segment_sky, select_far_lights, with_margin
 from .frames import Frames, Targets, subsample
 from .sweep_views import (
     SWEEP_WIDTH,
@@ -34,8 +34,11 @@ from .sweep_views import (
     bilinear,
     camera_centre,
     camera_spread,
+    farthest_distance,
     make_sweep_view,
+    median_focal_length,
     nearest_indices,
+    pixel_indices,
     project_sphere,
     visible_directions,
 )
@@ -68,7 +71,6 @@ MIN_FAR_SHARE, MIN_FAR_PATCHES = 0.12, 12
 RADIUS_FACTOR, MAX_PARALLAX_PX = 20.0, 0.25
 """Smallest radius of the far sphere relative to the distance of the farthest points, and the largest parallax of its
 points over the spread of the cameras, pixels of the fit's frames."""
-FARTHEST_QUANTILE = 0.99
 POINT_PITCH_PX = 4.0
 """Distance of neighbouring far points, pixels of the fit's frames."""
 MAX_POINTS, MAX_CANDIDATES = 16_000, 64_000
@@ -103,9 +105,8 @@ def find_far_layer(capture: Capture, views: tuple[View, ...], frames: Frames) ->
     sky = _find_sky(capture, sweep_views)
     if patches is None and sky is None:
         return None
-    distances = np.linalg.norm(capture.points.xyz - camera_centre(cameras), axis=1)
     focal = max(frames.camera(view).focal_length for view in sampled)  # the longest lens shows the most parallax
-    radius = max(RADIUS_FACTOR * float(np.quantile(distances, FARTHEST_QUANTILE)), spread * focal / MAX_PARALLAX_PX)
+    radius = max(RADIUS_FACTOR * farthest_distance(capture.points.xyz, cameras), spread * focal / MAX_PARALLAX_PX)
     sphere = FarSphere(tuple(map(float, camera_centre(cameras))), radius)
     return FarLayer(sphere, *_make_far_points(sphere, _FarParts(patches, sky), sampled, frames))
 
@@ -115,11 +116,10 @@ def _find_sky(capture: Capture, views: list[SweepView]) -> Sky | None:
     sky."""
     cameras = [view.camera for view in views]
     places = np.array([light.xyz for light in capture.lights if not light.moves]).reshape(-1, 3)
-    lights = far_lights(places, capture.points.xyz, cameras)
+    lights = select_far_lights(places, capture.points.xyz, cameras)
     if not len(lights):
         return None
-    pitch = PITCH_PX / float(np.median([camera.focal_length for camera in cameras]))
-    return find_even_sky(views, lights, capture.points.xyz, pitch)
+    return segment_sky(views, lights, capture.points.xyz, PITCH_PX / median_focal_length(cameras))
 
 
 def far_layer_messages(scene: SceneGaussians) -> tuple[str, ...]:
@@ -150,14 +150,15 @@ class _FarParts:
     patches: Patches | None
     sky: Sky | None
 
-    def contain(self, directions: Floats) -> Booleans:
-        """Return (m,) whether directions (m, 3) are far."""
+    def visible_directions(self, cameras: list[Camera], pitch: float) -> Floats:
+        """Return the far ones (n, 3) of `sweep_views.visible_directions`."""
+        directions = visible_directions(cameras, pitch)
         is_far = np.zeros(len(directions), bool)
         if self.patches is not None:
             is_far |= self.patches.are_far(directions)
         if self.sky is not None:
             is_far |= self.sky.contains(directions)
-        return is_far
+        return directions[is_far]
 
 
 def classify_patches(views: list[SweepView]) -> Patches | None:
@@ -188,7 +189,7 @@ def sweep_patches(views: list[SweepView]) -> SweepCosts:
     The cost of a patch is the mean over its directions. Patches that too few views see are left out.
     """
     cameras = [view.camera for view in views]
-    focal = float(np.median([camera.focal_length for camera in cameras]))
+    focal = median_focal_length(cameras)
     pitch = PITCH_PX / focal
     directions = visible_directions(cameras, pitch)
     patch_directions = visible_directions(cameras, PATCH_PITCHES * pitch)
@@ -238,7 +239,7 @@ def _disagreement(views: list[SweepView], directions: Floats, inverse_radius: fl
     values = np.full((len(views), len(directions), 3), np.nan, np.float32)
     for row, view in zip(values, views, strict=True):
         inside, places = project_sphere(view.camera, centre, directions, inverse_radius)
-        x, y = np.minimum(places.astype(int), np.array(view.camera.size) - 1).T
+        x, y = pixel_indices(places, view.camera.size)
         row[inside] = bilinear(view.picture, places)
         if view.counts is not None:
             row[np.flatnonzero(inside)[~view.counts[y, x]]] = np.nan
@@ -264,15 +265,12 @@ def _make_far_points(sphere: FarSphere, far_parts: _FarParts, views: Sequence[Vi
     a flare only adds light.
     """
     targets = [frames.targets(view) for view in views]
-    focal = float(np.median([target.camera.focal_length for target in targets]))
     cameras = [target.camera for target in targets]
-    seeing_cameras = cameras if far_parts.sky is None else [widened(camera) for camera in cameras]
-    pitch = max(POINT_PITCH_PX / focal, _least_pitch(far_parts, seeing_cameras))
-    directions = visible_directions(seeing_cameras, pitch)
-    directions = directions[far_parts.contain(directions)]
+    seeing_cameras = cameras if far_parts.sky is None else [with_margin(camera) for camera in cameras]
+    pitch = max(POINT_PITCH_PX / median_focal_length(cameras), _least_pitch(far_parts, seeing_cameras))
+    directions = far_parts.visible_directions(seeing_cameras, pitch)
     if len(directions) > MAX_POINTS:
-        directions = visible_directions(seeing_cameras, pitch * (len(directions) / MAX_POINTS) ** 0.5)
-        directions = directions[far_parts.contain(directions)]
+        directions = far_parts.visible_directions(seeing_cameras, pitch * (len(directions) / MAX_POINTS) ** 0.5)
     colours = _sample_colours(directions, views, targets, frames)
     opacities = np.full(len(directions), INITIAL_OPACITY)
     if far_parts.sky is not None:
@@ -294,8 +292,8 @@ def _least_pitch(far_parts: _FarParts, cameras: list[Camera]) -> float:
     They are measured by the directions of small pictures: in large frames, the lattice of the points has millions.
     """
     small = [camera.scaled(min(SWEEP_WIDTH, camera.width)) for camera in cameras]
-    pitch = PITCH_PX / float(np.median([camera.focal_length for camera in small]))
-    count = int(far_parts.contain(visible_directions(small, pitch)).sum())
+    pitch = PITCH_PX / median_focal_length(small)
+    count = len(far_parts.visible_directions(small, pitch))
     return pitch * float(np.sqrt(count / MAX_CANDIDATES))
 
 
@@ -310,7 +308,7 @@ def _sky_colours(colours: Values, directions: Floats, cameras: list[Camera], sky
         height, width = mask.shape
         small = camera.scaled(width)
         inside, places = project_sphere(small, camera.position, directions, 0.0)
-        x, y = np.minimum(places.astype(int), (width - 1, height - 1)).T
+        x, y = pixel_indices(places, (width, height))
         row[inside] = mask[y, x]
     shows_sky &= np.isfinite(colours[..., 0])
     has_colour = shows_sky.any(0)
@@ -330,6 +328,6 @@ def _sample_colours(directions: Floats, views: Sequence[View], targets: Sequence
         inside, places = project_sphere(small, camera.position, directions, 0.0)
         row[inside] = bilinear(values, places)
         if (mask := frames.mask(view)) is not None:
-            x, y = np.minimum((places / small.width * camera.width).astype(int), np.array(camera.size) - 1).T
+            x, y = pixel_indices(places / small.width * camera.width, camera.size)
             row[np.flatnonzero(inside)[~mask.numpy()[y, x]]] = np.nan
     return colours

@@ -16,6 +16,7 @@ from .sky import fibonacci_directions
 
 SWEEP_WIDTH = 120
 """Width of the views, pixels."""
+FARTHEST_QUANTILE = 0.99
 PAIRS_AT_ONCE = 1 << 24
 """Pairs of directions that are compared at a time; bounds the memory."""
 
@@ -119,3 +120,20 @@ def camera_centre(cameras: list[Camera]) -> Floats:
 def camera_spread(cameras: list[Camera]) -> float:
     """Return the largest distance of a camera from the mean position, world units."""
     return max(float(np.linalg.norm(camera.position - camera_centre(cameras))) for camera in cameras)
+
+
+def farthest_distance(points: Values, cameras: list[Camera]) -> float:
+    """Return the distance of the farthest of points (n, 3) from the cameras' mean position, without the farthest 1 %;
+    world units."""
+    return float(np.quantile(np.linalg.norm(points - camera_centre(cameras), axis=1), FARTHEST_QUANTILE))
+
+
+def median_focal_length(cameras: list[Camera]) -> float:
+    """Return the median focal length of cameras, pixels."""
+    return float(np.median([camera.focal_length for camera in cameras]))
+
+
+def pixel_indices(places: Floats, size: tuple[int, int]) -> NDArray[np.int64]:
+    """Return x and y (2, n) of the pixels that hold places (n, 2), pixels, in a frame of this width and height, which
+    contains its right and lower edge."""
+    return np.minimum(places.astype(np.int64), np.array(size) - 1).T

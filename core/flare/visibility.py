@@ -15,6 +15,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,6 +25,7 @@ from torch import Tensor
 from ..choices import Kernels
 from ..gaussians import rasterization
 from ..gaussians.kernels import fused_kernels
+from ..gaussians.rendering import OCCLUDER_REACH
 from ..gaussians.scene import SceneGaussians
 from ..look import PlacedLight
 from ..look.shot import LIGHT_MARGIN, LIGHT_RADIUS
@@ -33,6 +35,11 @@ MIN_CLEAR = 0.01
 """Clear visibility below which a scene says nothing about a light."""
 CLEAR_QUANTILE = 0.9
 """Quantile of the views' visibilities that counts as clear: a light may be hidden in most of them."""
+CONE_RADII = 4
+"""Slope, in radii of the disk, of the cone about a line of sight beyond which nothing hides the light: the corners of
+the small picture are at 2 sqrt(2)."""
+MAX_NEAR = 1e-3
+"""Largest near plane of a line of sight, relative to the light's distance."""
 MIN_RADIUS, MAX_RADIUS = 1e-4, 0.5
 """Range of the radius of a cell of an extent, relative to its distance."""
 OCCLUSION_WEIGHT, MIN_VISIBILITY = 1e-4, 1e-6
@@ -149,45 +156,75 @@ def light_visibility(scene: SceneGaussians, eye: Tensor, light: Tensor, settings
     return _visibilities(scene, eye[None], light[None], settings or VisibilitySettings(), kernels)[0]
 
 
+class _SightLines(NamedTuple):
+    """Lines of sight from cameras to m lights: poses (m, 4, 4), world to camera, of small cameras that look along them,
+    and the least and the greatest depth (m, 2) at which a Gaussian hides the light, world units."""
+
+    poses: Tensor
+    depths: Tensor
+
+
 def _visibilities(scene: SceneGaussians, eyes: Tensor, lights: Tensor, settings: VisibilitySettings,
                   kernels: Kernels) -> Tensor:
     """Return (m,), the `light_visibility` of each light from a camera; eyes, lights: (m, 3)."""
     if not len(lights):
         return scene.means.new_ones(0)
+    lines = _sight_lines(scene, eyes, lights, settings)
     fused = fused_kernels(scene.means) if kernels in ("auto", "cpu") else None
     far = scene.far
     visibilities = None if fused is None else fused.mean_transmittances(
-        scene.means, scene.quaternions, scene.log_scales, scene.opacity_logits, eyes, lights,
-        _disk_weights(settings.pixels), near=scene.near, margin=settings.margin, radius=settings.radius,
-        centre=(0.0, 0.0, 0.0) if far is None else far.centre,
-        max_distance=math.inf if far is None else far.min_distance)
+        scene.means, scene.quaternions, scene.log_scales, scene.opacity_logits, lines.poses, _intrinsics(settings),
+        _disk_weights(settings.pixels), lines.depths, CONE_RADII * settings.radius,
+        (0.0, 0.0, 0.0) if far is None else far.centre, math.inf if far is None else far.min_distance)
     if visibilities is None:
-        return torch.stack([_mean_transmittance(scene, eye, light, settings, kernels)
-                            for eye, light in zip(eyes, lights, strict=True)])
+        return torch.stack([_mean_transmittance(scene, pose, depths, settings, kernels)
+                            for pose, depths in zip(lines.poses, lines.depths.tolist(), strict=True)])
     return visibilities
 
 
-def _mean_transmittance(scene: SceneGaussians, eye: Tensor, light: Tensor, settings: VisibilitySettings,
-                        kernels: Kernels) -> Tensor:
-    """Return the mean transmittance (scalar, 0..1) of the Gaussians between a camera at `eye` and a light, (3,) each,
-    over the light's soft disk: the definition. It is 1 for a light at the eye."""
-    direction = (light - eye).float().numpy()
-    distance = float(np.linalg.norm(direction))
-    if distance <= 0:
-        return scene.means.new_ones(())
-    pose = _look_along(eye.float().numpy(), direction / np.float32(distance)).to(scene.means)
-    rows = _find_occluders(scene, pose, distance, settings)
-    size, half = settings.pixels, settings.pixels / 2
-    # The picture's edge is at twice the disk's radius, which is the window's standard deviation.
+def _sight_lines(scene: SceneGaussians, eyes: Tensor, lights: Tensor, settings: VisibilitySettings) -> _SightLines:
+    """Return the lines of sight from eyes to lights, (m, 3) each. Nothing hides a light at the eye."""
+    positions = eyes.double().numpy()
+    forward = lights.double().numpy() - positions
+    distances = np.linalg.norm(forward, axis=1)
+    forward /= np.where(distances > 0, distances, 1)[:, None]
+    # The roll is free: right is perpendicular to the axis that is least along the line.
+    right = np.cross(np.eye(3)[np.abs(forward).argmin(1)], forward)
+    right /= np.linalg.norm(right, axis=1).clip(1e-12)[:, None]
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    poses[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    poses[:, :3, 3] = -np.einsum("mij,mj->mi", poses[:, :3, :3], positions)
+    # At most the scene's near plane, so that everything a picture shows can hide a light.
+    near = np.minimum(MAX_NEAR * distances, scene.near)
+    far = np.where(distances > 0, (1 - settings.margin) * distances, -1)
+    return _SightLines(torch.from_numpy(poses.astype(np.float32)), torch.from_numpy(np.stack([near, far], 1)))
+
+
+def _intrinsics(settings: VisibilitySettings) -> Tensor:
+    """Return the intrinsics (3, 3) of the small cameras, px: the picture's edge is at twice the disk's radius, which is
+    the window's standard deviation."""
+    half = settings.pixels / 2
     focal = half / (2 * settings.radius)
-    intrinsics = torch.tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]])
+    return torch.tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]])
+
+
+def _mean_transmittance(scene: SceneGaussians, pose: Tensor, depths: Sequence[float], settings: VisibilitySettings,
+                        kernels: Kernels) -> Tensor:
+    """Return the mean transmittance (scalar, 0..1) of the Gaussians along a line of `_SightLines`, over the light's
+    soft disk: the definition."""
+    pose = pose.to(scene.means)
+    rows = _find_occluders(scene, pose, depths, settings)
+    if not len(rows):
+        return scene.means.new_ones(())
     # Colours are not needed, and their gradient would cost most.
     colourless = scene.means.new_zeros(len(rows), 1, 3)
     means, quaternions, log_scales, opacity_logits = (
         part.index_select(0, rows)
         for part in (scene.means, scene.quaternions, scene.log_scales, scene.opacity_logits))
-    alpha = rasterization(means, quaternions, log_scales, opacity_logits, colourless, pose, intrinsics.to(pose), size,
-                          size, near=_near_plane(scene, distance), depth=False, kernels=kernels, raw=True).alpha
+    size = settings.pixels
+    alpha = rasterization(means, quaternions, log_scales, opacity_logits, colourless, pose,
+                          _intrinsics(settings).to(pose), size, size, near=depths[0], depth=False, kernels=kernels,
+                          raw=True).alpha
     return ((1 - alpha) * _disk_weights(size).to(pose)).sum()
 
 
@@ -200,39 +237,16 @@ def _disk_weights(size: int) -> Tensor:
     return weights / weights.sum()
 
 
-def _near_plane(scene: SceneGaussians, distance: float) -> float:
-    """Return the smallest depth at which Gaussians hide a light at this distance, world units: at most the scene's near
-    plane, so that everything a picture shows can hide a light."""
-    return min(1e-3 * distance, scene.near)
-
-
 @torch.no_grad()
-def _find_occluders(scene: SceneGaussians, pose: Tensor, distance: float, settings: VisibilitySettings) -> Tensor:
+def _find_occluders(scene: SceneGaussians, pose: Tensor, depths: Sequence[float], settings: VisibilitySettings
+                    ) -> Tensor:
     """Return the rows of Gaussians between camera and light that may touch the small picture, without the far layer.
 
-    pose: world_to_camera (4, 4) of the small camera, on the scene's device. distance: from camera to light.
+    pose: world_to_camera (4, 4), on the scene's device. depths: least and greatest, of `_SightLines`.
     """
-    # The picture's corners are at 2 sqrt(2) radii from its middle.
     x, y, depth = (scene.means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
-    reach = 3 * scene.log_scales.amax(-1).exp()
-    between = (depth > _near_plane(scene, distance)) & (depth < (1 - settings.margin) * distance)
+    reach = OCCLUDER_REACH * scene.log_scales.amax(-1).exp()
+    between = (depth > depths[0]) & (depth < depths[1])
     if scene.far is not None:
         between &= ~scene.far.contains(scene.means)
-    return torch.nonzero(between & (torch.hypot(x, y) < depth * settings.radius * 4 + reach))[:, 0]
-
-
-def _look_along(position: NDArray[np.float32], forward: NDArray[np.float32]) -> Tensor:
-    """Return world_to_camera (4, 4) of a camera at a position (3,) that looks along the unit vector `forward` (3,),
-    with any roll."""
-    helper = np.eye(3, dtype=np.float32)[int(np.abs(forward).argmin())]
-    right = _cross(helper, forward)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4, dtype=np.float32)
-    pose[:3, :3] = right, _cross(forward, right), forward
-    pose[:3, 3] = -pose[:3, :3] @ position
-    return torch.from_numpy(pose)
-
-
-def _cross(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the cross product of two vectors (3,), in a tenth of the time of numpy.cross."""
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]], np.float32)
+    return torch.nonzero(between & (torch.hypot(x, y) < depth * settings.radius * CONE_RADII + reach))[:, 0]

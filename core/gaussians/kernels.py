@@ -99,8 +99,8 @@ class FusedKernels(Protocol):
         layers: Sequence[tuple[Tensor, Tensor]],
     ) -> Tensor | None: ...  # fmt: skip
     def mean_transmittances(
-        self, means: Tensor, quaternions: Tensor, log_scales: Tensor, opacity_logits: Tensor, eyes: Tensor,
-        lights: Tensor, disk: Tensor, *, near: float, margin: float, radius: float, centre: tuple[float, ...],
+        self, means: Tensor, quaternions: Tensor, log_scales: Tensor, opacity_logits: Tensor, poses: Tensor,
+        intrinsics: Tensor, weights: Tensor, depths: Tensor, slope: float, centre: tuple[float, ...],
         max_distance: float,
     ) -> Tensor | None: ...  # fmt: skip
     def upsample(

@@ -17,6 +17,8 @@ TRANSMITTANCE_MIN = 1e-4
 """Transmittance below which a pixel is finished: Gaussians behind are skipped."""
 STRENGTH2_MIN = 1e-16
 """Squared strength of an arc below which it has no direction and no gradient by it."""
+OCCLUDER_REACH = 3.0
+"""Largest standard deviations of a Gaussian up to which it may hide a light."""
 NEAR = 0.2
 """Camera depth up to which Gaussians are culled, world units."""
 

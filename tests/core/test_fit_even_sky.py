@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from core.capture import Camera, Capture
 from core.capture.colmap import PointCloud
 from core.capture.lights import Light
-from core.fit.even_sky import Sky, far_lights, find_even_sky
+from core.fit.even_sky import Sky, segment_sky, select_far_lights
 from core.fit.far_layer import find_far_layer
 from core.fit.frames import Frames
 from core.fit.sweep_views import SweepView
@@ -72,9 +72,9 @@ def shares(sky: Sky, view: SweepView) -> tuple[float, float]:
     return float(found[is_sky].mean()), float(found[~is_sky].mean())
 
 
-def test_the_even_sky_about_a_far_light_is_found_and_the_wall_is_not() -> None:
+def test_segmentation_covers_the_even_sky_about_a_far_light_and_not_the_wall() -> None:
     views = sweep(orbit(9, size=SIZE))
-    sky = find_even_sky(views, SUN[None], wall_points(), PITCH)
+    sky = segment_sky(views, SUN[None], wall_points(), PITCH)
     assert sky is not None
     for view, mask in zip(views, sky.masks, strict=True):
         in_sky, on_wall = shares(sky, view)
@@ -83,40 +83,40 @@ def test_the_even_sky_about_a_far_light_is_found_and_the_wall_is_not() -> None:
         assert not mask[-20:].any(), "the door is plain, too"
 
 
-def test_a_sky_is_found_where_few_views_show_the_light() -> None:
+def test_segmentation_propagates_to_views_without_the_light() -> None:
     cameras = orbit(9, size=SIZE)
     cameras = [camera if index < 2 else turned(camera, -0.08 * (index - 1)) for index, camera in enumerate(cameras)]
     views = sweep(cameras)
     assert sum(bool(camera.contains(*camera.project(SUN[None]))[0]) for camera in cameras) <= 4
-    sky = find_even_sky(views, SUN[None], wall_points(), PITCH)
+    sky = segment_sky(views, SUN[None], wall_points(), PITCH)
     assert sky is not None
     assert min(shares(sky, view)[0] for view in views) > 0.9
 
 
-def test_a_view_whose_light_is_hidden_adds_no_sky_there() -> None:
+def test_a_view_with_an_occluded_light_has_no_seed() -> None:
     views = sweep(orbit(9, size=SIZE))
     leaf = np.zeros((*SIZE[::-1], 1), np.float32)
     leaf[:34, 20:70] = 1
     hidden = [replace(view, picture=view.picture * (1 - leaf) + 0.15 * leaf) if index < 3 else view
               for index, view in enumerate(views)]
-    sky = find_even_sky(hidden, SUN[None], wall_points(), PITCH)
+    sky = segment_sky(hidden, SUN[None], wall_points(), PITCH)
     assert sky is not None
     assert not any(mask[:30, 26:64].any() for mask in sky.masks[:3])
     assert min(shares(sky, view)[0] for view in views) > 0.9, "the sky goes on behind the leaf"
 
 
 @pytest.mark.parametrize("place", [LAMP, -SUN], ids=["lamp", "behind"])
-def test_without_a_far_light_in_view_nothing_plain_is_sky(place: Floats) -> None:
+def test_without_a_far_light_in_view_there_is_no_sky(place: Floats) -> None:
     views = sweep(orbit(9, size=SIZE))
-    assert find_even_sky(views, SUN[None], wall_points(), PITCH) is not None
-    lights = far_lights(place[None], wall_points(), [view.camera for view in views])
+    assert segment_sky(views, SUN[None], wall_points(), PITCH) is not None
+    lights = select_far_lights(place[None], wall_points(), [view.camera for view in views])
     assert len(lights) == (0 if place is LAMP else 1)
-    assert find_even_sky(views, lights, wall_points(), PITCH) is None
+    assert segment_sky(views, lights, wall_points(), PITCH) is None
 
 
-def test_a_light_that_every_view_hides_shows_no_sky() -> None:
+def test_a_light_occluded_in_every_view_gives_no_sky() -> None:
     views = [replace(view, picture=view.picture * 0.15) for view in sweep(orbit(9, size=SIZE))]
-    assert find_even_sky(views, SUN[None], wall_points(), PITCH) is None
+    assert segment_sky(views, SUN[None], wall_points(), PITCH) is None
 
 
 def test_a_plain_surface_with_points_is_no_sky() -> None:
@@ -124,7 +124,7 @@ def test_a_plain_surface_with_points_is_no_sky() -> None:
     views = sweep(orbit(9, size=SIZE))
     x, y = np.meshgrid(np.linspace(-4, 4, 60), np.linspace(-3, WALL_TOP, 40))
     points = np.stack([x.ravel(), y.ravel(), np.full(x.size, WALL_Z)], 1).astype(np.float32)
-    assert find_even_sky(views, SUN[None], np.concatenate([wall_points(), points]), PITCH) is None
+    assert segment_sky(views, SUN[None], np.concatenate([wall_points(), points]), PITCH) is None
 
 
 def test_a_point_on_the_edge_of_the_frame_belongs_to_its_last_pixel() -> None:
@@ -132,10 +132,10 @@ def test_a_point_on_the_edge_of_the_frame_belongs_to_its_last_pixel() -> None:
     camera = views[0].camera
     ray = camera.rays(np.array([[float(camera.width), float(camera.height)]]))[0]
     edge = (camera.position + 3 * ray / np.linalg.norm(ray)).astype(np.float32)
-    assert find_even_sky(views, SUN[None], np.concatenate([wall_points(), edge[None]]), PITCH) is not None
+    assert segment_sky(views, SUN[None], np.concatenate([wall_points(), edge[None]]), PITCH) is not None
 
 
-def test_a_bright_wall_beside_the_sun_is_no_sky() -> None:
+def test_a_region_that_covers_little_of_the_seed_is_no_sky() -> None:
     """Its edge lies two pixels from the sun, and it is as plain as the sky."""
     views, masks = [], []
     for view in sweep(orbit(9, size=SIZE)):
@@ -144,26 +144,26 @@ def test_a_bright_wall_beside_the_sun_is_no_sky() -> None:
         wall[:, column:] = True
         views.append(replace(view, picture=np.where(wall[..., None], np.float32(0.55), view.picture)))
         masks.append(wall)
-    sky = find_even_sky(views, SUN[None], wall_points()[:40], PITCH)
+    sky = segment_sky(views, SUN[None], wall_points()[:40], PITCH)
     assert sky is not None
     for mask, wall in zip(sky.masks, masks, strict=True):
         assert (mask & wall).sum() <= 0.05 * wall.sum()
 
 
-def test_pixels_that_do_not_count_are_no_sky() -> None:
+def test_masked_pixels_are_no_sky() -> None:
     views = sweep(orbit(9, size=SIZE))
     counts = np.ones(views[0].picture.shape[:2], bool)
     counts[:, 60:] = False
     masked = [replace(view, counts=counts) for view in views]
-    sky = find_even_sky(masked, SUN[None], wall_points(), PITCH)
+    sky = segment_sky(masked, SUN[None], wall_points(), PITCH)
     assert sky is not None and all(mask[:, :58].any() and not mask[:, 62:].any() for mask in sky.masks)
 
 
 def test_a_lamp_that_shows_no_parallax_is_not_far_if_it_is_no_farther_than_the_room() -> None:
     cameras = [replace(camera, world_to_camera=look_at((0.01 * index, 0.0, -4.0))) for index, camera
                in enumerate(orbit(9, size=SIZE))]
-    assert not len(far_lights(LAMP[None], wall_points(), cameras))
-    assert len(far_lights(SUN[None], wall_points(), cameras))
+    assert not len(select_far_lights(LAMP[None], wall_points(), cameras))
+    assert len(select_far_lights(SUN[None], wall_points(), cameras))
 
 
 @pytest.fixture(scope="module")

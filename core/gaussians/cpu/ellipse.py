@@ -18,7 +18,7 @@ so alpha = opacity 2^(A u² + D d_y²), u = d_x + k d_y.
 With `raw`, scales are logarithms and opacities logits, the form in which they are optimised.
 
 In the backward pass the caller provides moments of g = dL / d ln alpha over the pixels: sums of g, g u, g d_y,
-g u², g u d_y, g d_y². They give the gradients of centre and covariance (`gradients_from_moments`).
+g u², g u d_y, g d_y². They give the gradients of centre and covariance (`_gradients_from_moments`).
 """
 from __future__ import annotations
 
@@ -32,19 +32,17 @@ from ..projection import FRUSTUM_MARGIN
 from .compilation import inlined, kernel
 from .layout import ALPHA_MIN, G_U, G_UU, G_UY, G_Y, G_YY, HALF, ONE, OPACITY_MAX, TWO, ZERO
 from .vector import (
-    LANES,
-    deinterleave,
     exp,
     fma,
-    interleave,
     load,
+    load3,
+    load4,
     log2,
     maximum,
     minimum,
     sigmoid,
     splat,
     sqrt,
-    store_rows,
     where,
 )
 
@@ -62,6 +60,7 @@ NORM2_MIN = np.float32(1e-16)
 MAX_INVERSE_NORM = np.float32(1e8)
 """Inverse length of the shortest quaternion that is normalised, the inverse root of NORM2_MIN."""
 MAX_DETERMINANT = np.float32(1e30)
+"""Determinant of a covariance, px^4, from which a Gaussian is not drawn: sums of it would overflow."""
 
 
 @kernel
@@ -89,11 +88,13 @@ def pack_camera(world_to_camera, intrinsics, width, height, near, dilation, came
 
 @inlined
 def dot(a, b):
+    """Return the scalar product of two vectors in space."""
     return fma(a[0], b[0], fma(a[1], b[1], a[2] * b[2]))
 
 
 @inlined
 def scaled(s, a):
+    """Return s a."""
     return a[0] * s, a[1] * s, a[2] * s
 
 
@@ -139,7 +140,7 @@ def _normalise(q):
 
 
 @inlined
-def _to_camera(camera, mean):
+def to_camera(camera, mean):
     """Return the camera coordinates of points (x, y, z)."""
     x, y, z = mean
     return (
@@ -150,25 +151,28 @@ def _to_camera(camera, mean):
 
 
 @inlined
-def _rotate_to_camera(camera, rows):
-    """Return the rows of R Q."""
-    q0, q1, q2 = rows
+def _camera_rotation(camera):
+    """Return the rows of R."""
     return (
-        add_scaled(add_scaled(scaled(camera[0], q0), camera[1], q1), camera[2], q2),
-        add_scaled(add_scaled(scaled(camera[3], q0), camera[4], q1), camera[5], q2),
-        add_scaled(add_scaled(scaled(camera[6], q0), camera[7], q1), camera[8], q2),
-    )
+        (camera[0], camera[1], camera[2]), (camera[3], camera[4], camera[5]), (camera[6], camera[7], camera[8]),
+    )  # fmt: skip
 
 
 @inlined
-def _rotate_to_world(camera, rows):
-    """Return the rows of R^T G, the gradient of Q from G, that of R Q."""
-    g0, g1, g2 = rows
-    return (
-        add_scaled(add_scaled(scaled(camera[0], g0), camera[3], g1), camera[6], g2),
-        add_scaled(add_scaled(scaled(camera[1], g0), camera[4], g1), camera[7], g2),
-        add_scaled(add_scaled(scaled(camera[2], g0), camera[5], g1), camera[8], g2),
-    )
+def _transposed(m):
+    return (m[0][0], m[1][0], m[2][0]), (m[0][1], m[1][1], m[2][1]), (m[0][2], m[1][2], m[2][2])
+
+
+@inlined
+def _combine(weights, rows):
+    """Return the sum of three rows, each times its weight."""
+    return add_scaled(add_scaled(scaled(weights[0], rows[0]), weights[1], rows[1]), weights[2], rows[2])
+
+
+@inlined
+def _matrix_product(m, rows):
+    """Return the rows of the product of two matrices (3, 3), from their rows."""
+    return _combine(m[0], rows), _combine(m[1], rows), _combine(m[2], rows)
 
 
 @inlined
@@ -196,27 +200,6 @@ def _covariance(a, b, dilation):
 
 
 @inlined
-def load3(array, first):
-    return deinterleave((load(array, 3 * first), load(array, 3 * first + 16), load(array, 3 * first + 32)))
-
-
-@inlined
-def load4(array, first):
-    at = 4 * first
-    return deinterleave((load(array, at), load(array, at + 16), load(array, at + 32), load(array, at + 48)))
-
-
-@inlined
-def store3(array, first, values):
-    store_rows(array, 3 * first, LANES, interleave(values))
-
-
-@inlined
-def store4(array, first, values):
-    store_rows(array, 4 * first, LANES, interleave(values))
-
-
-@inlined
 def _load_scales(scales, first, raw):
     s = load3(scales, first)
     return (exp(s[0]), exp(s[1]), exp(s[2])) if raw else s
@@ -224,12 +207,13 @@ def _load_scales(scales, first, raw):
 
 @inlined
 def load_opacities(opacities, first, raw):
+    """Return the opacities of the 16 Gaussians from `first` on."""
     o = load(opacities, first)
     return sigmoid(o) if raw else o
 
 
 @inlined
-def gradients_from_moments(fields, xy, yy, determinant):
+def _gradients_from_moments(fields, xy, yy, determinant):
     """Return the gradients of the centre and of the covariance xx, xy (which stands for both places), yy.
 
     fields: the summed gradient rows, one vector per field. With e = covariance^-1 d: dL/dcentre = sum g e,
@@ -274,13 +258,13 @@ class Axes(NamedTuple):
 def project_axes(means, quats, scales, raw, camera, first):
     """Return the Axes of the 16 Gaussians from `first` on."""
     mean, scale = load3(means, first), _load_scales(scales, first, raw)
-    point = _to_camera(camera, mean)
+    point = to_camera(camera, mean)
     is_in_front = point[2] > camera[NEAR]
     inverse_z = ONE / where(is_in_front, point[2], ONE)
     slopes = (point[0] * inverse_z, point[1] * inverse_z)
     quaternion, inverse_norm = _normalise(load4(quats, first))
     rotation = _rotation(quaternion[0], quaternion[1], quaternion[2], quaternion[3])
-    seen = _rotate_to_camera(camera, rotation)
+    seen = _matrix_product(_camera_rotation(camera), rotation)
     a, b, cx, cy = _image_axes(camera, seen, scale, slopes, inverse_z)
     return Axes(mean, point, is_in_front, inverse_z, slopes, (cx, cy), quaternion, inverse_norm, rotation, seen, scale,
                 a, b)
@@ -350,7 +334,7 @@ def axes_backward(axes, fields, camera, raw, d_depth):
     _, xy, yy, determinant = _covariance(a, b, camera[DILATION])
     is_drawable = axes.is_in_front & (determinant > ZERO) & (determinant < MAX_DETERMINANT) & (yy > ZERO)
     yy, determinant = where(is_drawable, yy, ONE), where(is_drawable, determinant, ONE)
-    dx, dy, d_xx, d_xy, d_yy = gradients_from_moments(fields, xy, yy, determinant)
+    dx, dy, d_xx, d_xy, d_yy = _gradients_from_moments(fields, xy, yy, determinant)
 
     # covariance -> a, b -> V, scales, slopes, depth; na, nb, n2: gradients of V_0 S, V_1 S, V_2 S
     da = add_scaled(scaled(d_xx * TWO, a), d_xy, b)
@@ -369,7 +353,8 @@ def axes_backward(axes, fields, camera, raw, d_depth):
         d_scale = _multiply_elements(d_scale, scale)
     dv = (_multiply_elements(na, scale), _multiply_elements(nb, scale), _multiply_elements(n2, scale))
     qw, qx, qy, qz = axes.quaternion
-    gw, gx, gy, gz = _rotation_backward(qw, qx, qy, qz, _rotate_to_world(camera, dv))
+    d_rotation = _matrix_product(_transposed(_camera_rotation(camera)), dv)  # Q from V = R Q
+    gw, gx, gy, gz = _rotation_backward(qw, qx, qy, qz, d_rotation)
     radial = fma(gw, qw, dot((gx, gy, gz), (qx, qy, qz)))
     radial = where(axes.inverse_norm < MAX_INVERSE_NORM, radial, ZERO)  # shorter ones were scaled by a constant
     d_quaternion = (

@@ -48,8 +48,6 @@ from .ellipse import (
     opacity_gradient,
     project_axes,
     scaled,
-    store3,
-    store4,
 )
 from .layout import (
     BLUE,
@@ -77,7 +75,6 @@ from .vector import (
     atomic_increment,
     exp2m1,
     fma,
-    interleave,
     lane_index,
     load,
     load_rows,
@@ -88,6 +85,9 @@ from .vector import (
     splat,
     sqrt,
     store,
+    store2,
+    store3,
+    store4,
     store_rows,
     to_ints,
     transpose,
@@ -143,7 +143,7 @@ def _project_block(
     axes = project_axes(means, quats, scales, raw, camera, first)
     opacity = minimum(splat(OPACITY_MAX), load_opacities(opacities, first, raw))  # NaN, as second, stays NaN
     e = ellipses(axes, opacity, camera, width, height)
-    _store2(centres, first, e.x, e.y)
+    store2(centres, first, (e.x, e.y))
     half_difference = (e.xx - e.yy) * HALF
     largest_variance = (e.xx + e.yy) * HALF + sqrt(fma(half_difference, half_difference, e.xy * e.xy))
     store(radii, first, where(e.is_visible & (e.reach > ZERO), sqrt(largest_variance) * np.float32(3), ZERO))
@@ -169,12 +169,6 @@ def _project_block(
         -(e.reach + MARGIN), e.half_x, e.half_y, splat(ZERO),
     ))  # fmt: skip
     store_rows(records, first * RECORD, RECORD, rows)
-
-
-@inlined
-def _store2(array, first, x, y):
-    """Write 16 rows of an (n, 2) array."""
-    store_rows(array, 2 * first, LANES, interleave((x, y)))
 
 
 @inlined
@@ -303,7 +297,7 @@ def _project_block_backward(
     `_add_camera_gradients`; transposed, rows: workspaces. The module head lists the others."""
     axes = project_axes(means, quats, scales, raw, camera, first)
     gradients = axes_backward(axes, fields, camera, raw, fields[G_DEPTH])
-    _store2(d_centres, first, gradients.centre[0], gradients.centre[1])
+    store2(d_centres, first, gradients.centre)
     opacity = load_opacities(opacities, first, raw)
     store(d_opacities, target_row, opacity_gradient(opacity, fields[G], raw))
     store3(d_scales, target_row, gradients.scale)

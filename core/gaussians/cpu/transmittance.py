@@ -15,7 +15,7 @@ light altogether, the logarithm of V still has a gradient by each of them.
 Arguments of the kernels:
 
     means, quats, scales, opacities   raw, see `rasterization`; flat
-    lines      (m, LINE), see `_lines_of_sight`
+    lines      (m, LINE): packed cameras, and the offsets below
     size       pixels of a side of the picture
     pixels     (2, p) x and y of the pixel centres, px; p: size² rounded up to whole vectors
 """
@@ -30,31 +30,21 @@ from torch import Tensor
 
 from ...conventions.pixel_grid import DILATION
 from .. import rendering
-from ..projection import FRUSTUM_MARGIN
 from . import buffers
 from .buffers import Array
 from .compilation import inlined, kernel
 from .ellipse import (
     CAMERA,
-    CX,
-    FX,
-    HIGH_X,
-    HIGH_Y,
-    LOW_X,
-    LOW_Y,
     NEAR,
     axes_backward,
     ellipses,
-    load3,
-    load4,
     load_opacities,
     mean_gradient,
     opacity_gradient,
+    pack_camera,
     project_axes,
-    store3,
-    store4,
+    to_camera,
 )
-from .ellipse import DILATION as DILATION_AT
 from .layout import ALPHA_MIN, ONE, OPACITY, OPACITY_MAX, RECORD, ZERO, A, D, G, K, X, Y
 from .raster_forward import POWER_MIN
 from .stepping import add_gradients
@@ -69,6 +59,8 @@ from .vector import (
     fma,
     lane_index,
     load,
+    load3,
+    load4,
     load_rows,
     load_scalar,
     maximum,
@@ -77,6 +69,8 @@ from .vector import (
     splat,
     sqrt,
     store,
+    store3,
+    store4,
     store_rows,
     transpose,
     where,
@@ -87,14 +81,11 @@ FAR_DEPTH, CONE_SLOPE, CENTRE, MAX_DISTANCE2, LINE = CAMERA, CAMERA + 1, CAMERA 
 cone about the line, centre of the far sphere, squared distance from it beyond which nothing hides the light."""
 HIDES = OPACITY + 1
 """Field of a record, here 1 for a Gaussian that may hide the light and 0 for others."""
-REACH = np.float32(3)
-"""Standard deviations up to which a Gaussian hides a light."""
-CONE_RADII = 4
-"""Slope of the cone about a line, in radii of the disk: the picture's corners are at 2 sqrt(2)."""
+REACH = np.float32(rendering.OCCLUDER_REACH)
 T_LEAST = np.float32(rendering.TRANSMITTANCE_MIN * (1 - rendering.OPACITY_MAX))
 """Least transmittance of a pixel."""
-CHUNK = 1 << 12
-"""Gaussians of a task."""
+GAUSSIANS_PER_TASK = 1 << 12
+"""Gaussians that a thread processes at a time: a chunk."""
 SQUARE = LANES * LANES
 
 
@@ -103,9 +94,7 @@ def _find_occluders(means, scales, line, first, is_new):
     """Return which of the 16 Gaussians from `first` on may hide the light: those in front of it, near enough to the
     line. is_new: lanes that count."""
     x, y, z = load3(means, first)
-    depth = fma(x, line[6], fma(y, line[7], fma(z, line[8], splat(line[11]))))
-    across = fma(x, line[0], fma(y, line[1], fma(z, line[2], splat(line[9]))))
-    down = fma(x, line[3], fma(y, line[4], fma(z, line[5], splat(line[10]))))
+    across, down, depth = to_camera(line, (x, y, z))
     scale_x, scale_y, scale_z = load3(scales, first)
     reach = exp(maximum(maximum(scale_x, scale_y), scale_z)) * REACH
     far_x, far_y, far_z = x - line[CENTRE], y - line[CENTRE + 1], z - line[CENTRE + 2]
@@ -145,7 +134,7 @@ def _alphas(records, record, pixels, i):
 @inlined
 def _chunk_bounds(chunk, chunks, n):
     """Return the first Gaussian of a chunk, and the one after its last; a remainder below 16 joins the last chunk."""
-    return chunk * CHUNK, n if chunk == chunks - 1 else (chunk + 1) * CHUNK
+    return chunk * GAUSSIANS_PER_TASK, n if chunk == chunks - 1 else (chunk + 1) * GAUSSIANS_PER_TASK
 
 
 @kernel
@@ -189,14 +178,19 @@ def _moments(records, record, pixels, weights):
 
 
 @inlined
-def _masked(mask, values):
-    return where(mask, values[0], ZERO), where(mask, values[1], ZERO), where(mask, values[2], ZERO)
+def _accumulate3(array, first, mask, values):
+    """Add vectors x, y and z, where the mask is true, to 16 rows of an array (n, 3)."""
+    x, y, z = load3(array, first)
+    store3(array, first, (x + where(mask, values[0], ZERO), y + where(mask, values[1], ZERO),
+                          z + where(mask, values[2], ZERO)))
 
 
 @inlined
-def _add3(array, first, values):
-    x, y, z = load3(array, first)
-    store3(array, first, (x + values[0], y + values[1], z + values[2]))
+def _accumulate4(array, first, mask, values):
+    """Add vectors w, x, y and z, where the mask is true, to 16 rows of an array (n, 4)."""
+    w, x, y, z = load4(array, first)
+    store4(array, first, (w + where(mask, values[0], ZERO), x + where(mask, values[1], ZERO),
+                          y + where(mask, values[2], ZERO), z + where(mask, values[3], ZERO)))
 
 
 @kernel
@@ -231,12 +225,10 @@ def transmittance_backward_kernel(
                         store(rows, record, _moments(records, record, pixels, weights[number]) if is_occluder else zero)
                     fields = transpose(load_rows(rows, 0, LANES))
                     gradients = axes_backward(axes, fields, line, True, zero)
-                    _add3(d_means, first, _masked(hides, mean_gradient(gradients.point, line, (zero, zero, zero))))
-                    _add3(d_scales, first, _masked(hides, gradients.scale))
-                    w, x, y, z = load4(d_quats, first)
-                    q = gradients.quaternion
-                    store4(d_quats, first, (w + where(hides, q[0], ZERO), x + where(hides, q[1], ZERO),
-                                            y + where(hides, q[2], ZERO), z + where(hides, q[3], ZERO)))
+                    d_mean = mean_gradient(gradients.point, line, (zero, zero, zero))
+                    _accumulate3(d_means, first, hides, d_mean)
+                    _accumulate3(d_scales, first, hides, gradients.scale)
+                    _accumulate4(d_quats, first, hides, gradients.quaternion)
                     d_opacity = where(hides, opacity_gradient(opacity, fields[G], True), ZERO)
                     store(d_opacities, first, load(d_opacities, first) + d_opacity)
 
@@ -244,9 +236,10 @@ def transmittance_backward_kernel(
 class _MeanTransmittances(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, lines: Array, disk: Tensor, *parameters: Tensor) -> Tensor:
-        """Return (m,), the mean transmittances; lines (m, LINE), disk (size, size), parameters of the Gaussians."""
+        """Return (m,), the mean transmittances; lines (m, LINE), disk (size, size): weights of the
+        pixels, parameters of the Gaussians."""
         n, size = len(parameters[0]), len(disk)
-        chunks = max(1, n // CHUNK + (n % CHUNK >= LANES))
+        chunks = max(1, n // GAUSSIANS_PER_TASK + (n % GAUSSIANS_PER_TASK >= LANES))
         pixels, weights = _pixel_centres(size), _pad(disk.numpy().ravel())
         arrays = tuple(map(flat, parameters))
         products = buffers.empty(len(lines) * chunks * len(weights))
@@ -270,47 +263,28 @@ class _MeanTransmittances(torch.autograd.Function):
 
 
 def mean_transmittances(
-    means: Tensor, quaternions: Tensor, log_scales: Tensor, opacity_logits: Tensor, eyes: Tensor, lights: Tensor,
-    disk: Tensor, *, near: float, margin: float, radius: float, centre: tuple[float, ...], max_distance: float,
+    means: Tensor, quaternions: Tensor, log_scales: Tensor, opacity_logits: Tensor, poses: Tensor, intrinsics: Tensor,
+    weights: Tensor, depths: Tensor, slope: float, centre: tuple[float, ...], max_distance: float,
 ) -> Tensor | None:  # fmt: skip
-    """Return the transmittances (m,), 0..1, of n Gaussians between m cameras and lights; None for fewer than 16.
+    """Return the mean transmittances (m,), 0..1, of n Gaussians along m lines of sight; None for fewer than 16
+    Gaussians.
 
-    means (n, 3), quaternions (n, 4), log_scales (n, 3), opacity_logits (n,): as of `SceneGaussians`. eyes, lights: (m,
-    3). disk (size, size): weights of the pixels of a light's disk, whose radius at the picture's edge is 2 `radius`,
-    relative to the distance. A Gaussian counts if its depth is above the smaller of `near` and a thousandth of the
-    light's distance. It must lie before the last `margin`, a share, of that distance, and within max_distance of
-    `centre`. Lengths are in world units. Differentiable by the Gaussians.
+    means (n, 3), quaternions (n, 4), log_scales (n, 3), opacity_logits (n,): as of `SceneGaussians`. poses (m, 4, 4),
+    world to camera, and intrinsics (3, 3), px: of the small cameras. weights (size, size): of the pixels of a picture;
+    they sum to 1. A Gaussian counts if it lies between the two depths (m, 2), nearer to the line than `slope` times its
+    depth plus OCCLUDER_REACH of its largest standard deviations, and within max_distance of `centre`. Lengths are in
+    world units. Differentiable by the Gaussians.
     """
     if len(means) < LANES:
         return None
-    lines = _lines_of_sight(eyes.double().numpy(), lights.double().numpy(), len(disk), near, margin, radius)
-    lines[:, CENTRE : CENTRE + 3], lines[:, MAX_DISTANCE2] = centre, max_distance**2
-    result: Tensor = _MeanTransmittances.apply(lines, disk, means, quaternions, log_scales, opacity_logits)
+    size, lines = len(weights), np.empty((len(poses), LINE), np.float32)
+    for line, pose, (near, far) in zip(lines, poses, depths.tolist(), strict=True):
+        pack_camera(flat(pose), flat(intrinsics), size, size, near, DILATION, line[:CAMERA])
+        line[FAR_DEPTH] = far
+    lines[:, CONE_SLOPE], lines[:, MAX_DISTANCE2] = slope, max_distance**2
+    lines[:, CENTRE : CENTRE + 3] = centre
+    result: Tensor = _MeanTransmittances.apply(lines, weights, means, quaternions, log_scales, opacity_logits)
     return result
-
-
-def _lines_of_sight(eyes: Array, lights: Array, size: int, near: float, margin: float, radius: float) -> Array:
-    """Return the lines (m, LINE) from eyes to lights (m, 3), without the far sphere; see `mean_transmittances`.
-
-    A light at the eye gets a line on which nothing lies.
-    """
-    forward = lights - eyes
-    distances = np.linalg.norm(forward, axis=1)
-    forward /= np.where(distances > 0, distances, 1)[:, None]
-    # The roll of the camera is free: its right is perpendicular to the axis that is least along the line.
-    right = np.cross(np.eye(3)[np.abs(forward).argmin(1)], forward)
-    right /= np.linalg.norm(right, axis=1).clip(1e-12)[:, None]
-    rotations = np.stack([right, np.cross(forward, right), forward], 1)
-    focal = size / (4 * radius)  # the picture's edge is at twice the disk's radius
-    bound = size / (2 * focal) * (1 + FRUSTUM_MARGIN)
-    lines = np.zeros((len(eyes), LINE), np.float32)
-    lines[:, :9] = rotations.reshape(-1, 9)
-    lines[:, 9:12] = -np.einsum("mij,mj->mi", rotations, eyes)
-    lines[:, FX : FX + 2], lines[:, CX : CX + 2], lines[:, DILATION_AT] = focal, size / 2, DILATION
-    lines[:, [LOW_X, LOW_Y]], lines[:, [HIGH_X, HIGH_Y]] = -bound, bound
-    lines[:, NEAR], lines[:, CONE_SLOPE] = np.minimum(1e-3 * distances, near), CONE_RADII * radius
-    lines[:, FAR_DEPTH] = np.where(distances > 0, (1 - margin) * distances, -1)
-    return lines
 
 
 def _pad(values: Array) -> Array:

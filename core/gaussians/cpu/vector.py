@@ -637,6 +637,43 @@ def deinterleave(typing_context, vectors):  # noqa: ARG001
     return types.UniTuple(FLOATS, count)(vectors), emit
 
 
+# --- 16 rows of arrays, flat ------------------------------------------------------------------------------
+
+
+@inlined
+def load3(array, first):
+    """Return the three columns of 16 rows of an array (n, 3), from row `first` on."""
+    at = 3 * first
+    return deinterleave((load(array, at), load(array, at + LANES), load(array, at + 2 * LANES)))
+
+
+@inlined
+def load4(array, first):
+    """Return the four columns of 16 rows of an array (n, 4), from row `first` on."""
+    at = 4 * first
+    return deinterleave((
+        load(array, at), load(array, at + LANES), load(array, at + 2 * LANES), load(array, at + 3 * LANES),
+    ))  # fmt: skip
+
+
+@inlined
+def store2(array, first, columns):
+    """Write the two columns of 16 rows of an array (n, 2), from row `first` on."""
+    store_rows(array, 2 * first, LANES, interleave(columns))
+
+
+@inlined
+def store3(array, first, columns):
+    """Write the three columns of 16 rows of an array (n, 3), from row `first` on."""
+    store_rows(array, 3 * first, LANES, interleave(columns))
+
+
+@inlined
+def store4(array, first, columns):
+    """Write the four columns of 16 rows of an array (n, 4), from row `first` on."""
+    store_rows(array, 4 * first, LANES, interleave(columns))
+
+
 # --- elementary functions --------------------------------------------------------------------------------
 
 # 2^f on [-1/2, 1/2]: the minimax polynomial in relative error that is exact at 0 (8e-8).

@@ -4,6 +4,7 @@
     exposure.py, grounded.py   two detectors behind one interface (detection.py)
     triangulation.py           detections of many views to places, near or far, by way of observations.py,
                                candidates.py, refinement.py and merging.py
+    surroundings.py, surfaces.py   tell gaps before a bright sky, windows and lit walls from lamps
     lifted.py                  the same by way of a fitted scene's Gaussians
     ghosts.py                  a light out of frame, from its ghosts
     file.py, overlay.py        lights.json, and pictures of the result

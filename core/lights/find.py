@@ -22,6 +22,7 @@ from .file import write_lights
 from .found_light import FAR, FoundLight
 from .ghosts import find_blobs, locate_by_ghosts
 from .lifted import lift_to_gaussians
+from .surfaces import split_surfaces
 from .surroundings import brightness_map, clipped_area, split_gaps
 from .tracks import TrackedLight, TrackFindings, track_lights
 from .triangulation import TriangulationSettings, triangulate_lights
@@ -37,9 +38,9 @@ MAX_STATIC_DISTANCE = 0.006
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """The result of a search: lights, best supported first; doubtful ones with too few views; detections of each view.
+    """The result of a search: lights, doubtful places, and the detections of each view.
 
-    messages: sentences for the user.
+    lights: best supported first. doubtful: each with its doubt. messages: sentences for the user.
     """
 
     lights: list[FoundLight]
@@ -76,10 +77,15 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
         candidates = _triangulate_any(views, detections, capture.extent, settings)
         supported = [light for light in candidates if _is_well_supported(light, min_views, settings)]
         lights, gaps = split_gaps(supported, dict(views), brightness_maps)
-        doubtful = [*gaps, *(light for light in candidates if not _is_well_supported(light, min_views, settings))]
+        lights, surfaces = split_surfaces(lights, dict(views), brightness_maps)
+        unsupported = [light for light in candidates if not _is_well_supported(light, min_views, settings)]
+        doubtful = [replace(light, doubt=doubt) for doubt, places in
+                    (("gap", gaps), ("surface", surfaces), ("few views", unsupported)) for light in places]
         if gaps:
-            messages.append(f"{len(gaps)} places are no lights but gaps through which a bright far surrounding shows; "
-                            "`lights/report.json` lists them as doubtful.")
+            messages.append(f"{len(gaps)} places are no lights but gaps through which a bright far surrounding shows.")
+        if surfaces:
+            messages.append(f"{len(surfaces)} places are no lights but parts of bright surfaces, such as windows or "
+                            "lit walls.")
     if len(views) > 1:
         lights_by_ghosts, message = _find_by_ghosts(capture, lights, brightness_maps, progress, settings.seed)
         lights += lights_by_ghosts
@@ -163,8 +169,9 @@ def write_findings(capture: Capture, findings: Findings, keep: bool = False, tra
         sheets = write_track_sheets(capture.folder / SHEETS, lit_capture, tracked.sources)
     report = {
         "lights": entries, "says": findings.messages,
-        "doubtful": [{"xyz": light.xyz.round(5).tolist(), "far": light.far, "support": list(light.support),
-                      "residual_px": round(light.residual, 3), "uncertainty": _round_finite(light.uncertainty)}
+        "doubtful": [{"xyz": light.xyz.round(5).tolist(), "far": light.far, "doubt": light.doubt,
+                      "support": list(light.support), "residual_px": round(light.residual, 3),
+                      "uncertainty": _round_finite(light.uncertainty)}
                      for light in findings.doubtful],
         "support": {name: list(light.support) for name, light in lights_by_name},
         "views": [{"name": view.name, "detections": [

@@ -156,8 +156,10 @@ def _find_and_record(capture: Capture, detector: Detector, progress: Progress,
     for light in report["lights"]:
         progress.say(_describe_light(light))
     if findings.doubtful:
-        progress.say(f"Left out as doubtful: {len(findings.doubtful)} lights that too few views show. "
-                     f"{capture.folder / SHEETS / REPORT} lists them; add them by hand where they are real.")
+        unsupported = sum(light.doubt == "few views" for light in findings.doubtful)
+        progress.say(f"Left out as doubtful: {len(findings.doubtful)} places, {unsupported} of them since too few "
+                     f"views show them. {capture.folder / SHEETS / REPORT} lists them; add them by hand where they are "
+                     "lights.")
     progress.say(f"Look at {capture.folder / report['sheets'][0]}. You can edit {LIGHTS}; `lights --keep` keeps your "
                  "changes.")
     return report

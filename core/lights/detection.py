@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 from ..images.picture import Picture
 
 Mask = NDArray[np.bool_]
+RIM = 0.3, 0.8
+"""Distances from the edge of a light, radii, between which its surround is measured."""
+SURROUND_QUANTILE = 0.2
+"""Quantile of the surround over its pixels: a lamp lights up or outshines all sides, a window ends at a dark frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +28,7 @@ class Detection:
     colour: (3,) linear Rec. 709 of the glow round the clipped core, its largest channel 1.
     mask: (h, w) of the light within its box; corner: (x, y) of the box in the picture.
     is_cut: True if it touches the frame's edge, so that its centroid is not the light's.
+    surround: linear light, 0..1, on the darker sides of the light (quantile SURROUND_QUANTILE within RIM).
     """
 
     xy: NDArray[np.float64]
@@ -33,6 +38,7 @@ class Detection:
     mask: Mask
     corner: tuple[int, int]
     is_cut: bool
+    surround: float = 0.0
 
     @property
     def box(self) -> tuple[int, int, int, int]:
@@ -82,15 +88,17 @@ def measure_detection(mask: Mask, corner: tuple[int, int], picture: Picture, dis
     is_cut = bool((corner[0] == 0 and mask[:, 0].any()) or (corner[1] == 0 and mask[0].any())
                   or (right == width and mask[:, -1].any()) or (bottom == height and mask[-1].any()))
     radius = float(np.sqrt(mask.sum() / np.pi))
-    return Detection(xy, radius, score, _glow_colour(mask, corner, picture), mask, corner, is_cut)
+    colour, surround = _measure_around(mask, corner, picture)
+    return Detection(xy, radius, score, colour, mask, corner, is_cut, surround)
 
 
-def _glow_colour(mask: Mask, corner: tuple[int, int], picture: Picture) -> NDArray[np.float64]:
-    """Return the colour of the glow: the light within half a radius of the disc minus that two to three radii away.
+def _measure_around(mask: Mask, corner: tuple[int, int], picture: Picture) -> tuple[NDArray[np.float64], float]:
+    """Return the colour of the glow and the surround of a light.
 
-    (3,) linear, the largest channel 1; white where no glow can be measured. At most half of the near light is
-    subtracted, so that some glow is left beside a bright surface. mask: (h, w), the disc, whose top left pixel is
-    `corner` (x, y) of the picture.
+    The colour is the light within half a radius of the disc minus that two to three radii away: (3,) linear, the
+    largest channel 1; white where no glow can be measured. At most half of the near light is subtracted, so that some
+    glow is left beside a bright surface. The surround is as in `Detection`. mask: (h, w), the disc, whose top left
+    pixel is `corner` (x, y) of the picture.
     """
     import cv2
 
@@ -106,9 +114,11 @@ def _glow_colour(mask: Mask, corner: tuple[int, int], picture: Picture) -> NDArr
     around = Picture(picture.pixels[top:bottom, left:right], picture.encoding).linear()
     near = (distance > 1) & (distance <= 1 + 0.5 * reach)
     far = (distance > 2 * reach) & (distance <= 3 * reach)
+    rim = (distance > RIM[0] * reach) & (distance <= RIM[1] * reach)
+    surround = float(np.quantile(around[rim].mean(axis=1).clip(0, 1), SURROUND_QUANTILE)) if rim.any() else 0.0
     if not near.any():
-        return np.ones(3)
+        return np.ones(3), surround
     glow = around[near].mean(axis=0).astype(np.float64)
     if far.any():
         glow = glow - np.minimum(np.median(around[far], axis=0), 0.5 * glow)
-    return glow / glow.max() if glow.max() > 1e-4 else np.ones(3)
+    return glow / glow.max() if glow.max() > 1e-4 else np.ones(3), surround

@@ -3,7 +3,7 @@
 
 A lamp has one shape, which recurs in the views that nothing hides it from. A part of a bright surface has the shape of
 the gap in what stands before it, which changes from view to view. In some views nothing cuts it out: the surface is as
-bright there, but the detector finds no compact spot.
+bright there, but the detector finds no compact spot. A large part ends at something dark, such as a frame.
 """
 from __future__ import annotations
 
@@ -33,6 +33,9 @@ MIN_SUPPORT_RATIO = 0.4
 LARGE_RADIUS, MIN_LARGE_CONSTANCY = 0.018, 0.75
 """Radius of a light, frame diagonals, from which it is large, and the least product of its recurrence and its support
 ratio: little hides much of it, and most large bright regions are surfaces."""
+MAX_DARK_SURROUND = 0.2
+"""Median surround of a large light's detections, linear light, from which it is a lamp all the same: its glow or the
+wall that it lights is bright on all sides."""
 
 
 def split_surfaces(lights: Sequence[FoundLight], cameras: Mapping[str, Camera],
@@ -87,8 +90,8 @@ def _is_surface(light: FoundLight, cameras: Mapping[str, Camera], maps: Mapping[
     diagonal = float(np.median([np.hypot(*camera.size) for camera in cameras.values()]))
     is_large = light.radius >= LARGE_RADIUS * diagonal
     recurrence, ratio = shape_recurrence(light, cameras), support_ratio(light, cameras, maps)
-    if is_large:  # one that no view shows whole is a surface
-        return recurrence is None or recurrence * ratio < MIN_LARGE_CONSTANCY
+    if is_large and np.median([detection.surround for _, detection in light.detections]) < MAX_DARK_SURROUND:
+        return recurrence is None or recurrence * ratio < MIN_LARGE_CONSTANCY  # None: no view shows it whole
     return ratio < MIN_SUPPORT_RATIO or (recurrence is not None and recurrence < MIN_RECURRENCE)
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from core.capture import Camera, Capture
 from core.images.picture import Picture
 from core.lights import Detection, find_lights
+from core.lights.detection import measure_detection
 from core.lights.found_light import FoundLight
 from core.lights.surfaces import shape_recurrence, split_surfaces, support_ratio
 from tests.core.captures import make_capture, orbit
@@ -94,6 +95,9 @@ def test_a_large_surface_is_bright_where_it_is_not_detected(cameras: dict[str, C
     board = light_of(dict(list(masks.items())[:6]))
     assert is_lamp(board, cameras, dark(cameras)), "something may hide it in the other views"
     assert not is_lamp(board, cameras, masks)
+    lit = replace(board, detections=tuple((name, replace(detection, surround=0.5))
+                                          for name, detection in board.detections))
+    assert is_lamp(lit, cameras, masks), "a glow on all sides"
     small = light_of({name: disc(camera, 0.5 * RADIUS) for name, camera in list(cameras.items())[:6]})
     assert is_lamp(small, cameras, masks), "a small lamp before a wall is missed in some views"
     rare = light_of({name: disc(camera, 0.5 * RADIUS) for name, camera in list(cameras.items())[:3]})
@@ -133,3 +137,17 @@ def test_the_search_reports_surfaces_as_doubtful(tmp_path: Path, cameras: dict[s
     assert len(findings.lights) == lamp
     assert [light.doubt for light in findings.doubtful] == ([] if lamp else ["surface"])
     assert any("surfaces" in message for message in findings.messages) != lamp
+
+
+@pytest.mark.parametrize(("dark_side", "surround"), [(False, 0.5), (True, 0.0)])
+def test_the_surround_is_that_of_the_darker_sides(dark_side: bool, surround: float) -> None:
+    v, u = np.mgrid[:60, :80] + 0.5
+    mask = np.hypot(u - 40, v - 30) < 10
+    linear = np.where(mask, 1.0, 0.5)
+    if dark_side:
+        linear[:, :30] = 0
+    picture = Picture(np.repeat(linear[..., None], 3, axis=2).astype(np.float32), "linear")
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    tight = mask[rows[0]:rows[-1] + 1, columns[0]:columns[-1] + 1]
+    detection = measure_detection(tight, (int(columns[0]), int(rows[0])), picture, picture.display(), 1.0)
+    assert detection.surround == pytest.approx(surround, abs=1e-3)

@@ -61,6 +61,7 @@ def read_config(path: Path, progress: Progress | None = None) -> FitSettings:
             raise ValueError("it has no mode")
         values, renamed = current_names(_flatten(data))
         values.pop("split.excess_unfound", None)  # a setting that no longer exists
+        values.setdefault("split.few_views", 0)  # runs without it are resumed as they were begun
         settings: FitSettings = parse_table(FitSettings, _nest(values)).validated()
     except OSError as problem:
         raise RunError(f"{path} cannot be read ({problem.strerror}); name the folder of a run.") from problem

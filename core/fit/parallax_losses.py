@@ -27,9 +27,35 @@ MAX_EXCESS_RATIO = 1e9
 """Largest `excess_ratio`, that of a scene that is nowhere brighter than the frames."""
 
 
-def scene_only_iterations(settings: SplitSettings, views: int, iterations: int) -> int:
-    """Return the number of iterations, of `iterations`, in which the scene is fitted alone."""
-    return min(settings.scene_only_rounds * views, iterations // 3)
+def divergence(settings: SplitSettings, ratio: float) -> float:
+    """Return how far a scene is from convergence, 0..1, by its `excess_ratio`.
+
+    0 from `settings.converged_ratio` on, 1 from `settings.diverged_ratio` down.
+    """
+    span = max(settings.converged_ratio - settings.diverged_ratio, 1e-9)
+    return min(max((settings.converged_ratio - ratio) / span, 0.0), 1.0)
+
+
+def ambiguity(settings: SplitSettings, views: int, ratio: float) -> float:
+    """Return how little the parallax of a capture decides between scene and flare, 0..1.
+
+    The `divergence` of its scene, times its sparsity: 0 from `settings.few_views` training views on, 1 from half of
+    them down.
+    """
+    sparsity = min(max(settings.few_views / max(views, 1) - 1, 0.0), 1.0)
+    return sparsity * divergence(settings, ratio)
+
+
+def scene_only_iterations(settings: SplitSettings, views: int, iterations: int, ratio: float = MAX_EXCESS_RATIO) -> int:
+    """Return the number of iterations, of `iterations`, in which the scene is fitted alone.
+
+    `settings.scene_only_rounds` passes over the views, and up to a third of all iterations by the capture's
+    `ambiguity`: these passes over few views can be too few steps for a scene to converge. ratio: the `excess_ratio`
+    after the passes.
+    """
+    third = iterations // 3
+    passes = min(settings.scene_only_rounds * views, third)
+    return passes + round(ambiguity(settings, views, ratio) * (third - passes))
 
 
 def scene_loss(scene: Tensor, targets: Targets, lights: ArrayLike, discs: Tensor | None,
@@ -63,19 +89,23 @@ def estimate_loss(scene: Tensor, estimate: Tensor, ssim_share: float, progress: 
 
 
 def far_flare_penalty(added: Tensor, estimated_flare: Tensor | None, ratio: float, camera: Camera, lights: ArrayLike,
-                      settings: SplitSettings) -> Tensor:
+                      settings: SplitSettings, views: int) -> Tensor:
     """Return the penalty on `added`, the light that a flare adds, far from the lights (n, 3), world.
 
     added: (height, width, 3), display values. The penalty is for a scene that has not converged. Missing a ghost costs
     more than this penalty, so ghosts, which the scene cannot reproduce, stay in the flare; other light moves to the
     scene. estimated_flare: frame minus estimated clean frame, or None. ratio: the scene's `excess_ratio`; from
     `settings.diverged_ratio` to `settings.converged_ratio` the exempt share of the estimated flare rises from 0 to 1.
+    views: number of training views. The weight rises with the capture's `ambiguity` from `settings.far_flare_penalty`
+    to `settings.sparse_far_flare_penalty`.
     """
     if estimated_flare is not None:
-        confidence = (ratio - settings.diverged_ratio) / max(settings.converged_ratio - settings.diverged_ratio, 1e-9)
-        added = (added - min(max(confidence, 0), 1) * estimated_flare.clamp(min=0)).clamp(min=0)
+        exempt_share = 1 - divergence(settings, ratio)
+        added = (added - exempt_share * estimated_flare.clamp(min=0)).clamp(min=0)
     far = torch.from_numpy(1 - light_proximity(camera, lights, settings.light_radius)).to(added.device)
-    return settings.far_flare_penalty * (added * far[..., None]).mean()
+    share = ambiguity(settings, views, ratio)
+    weight = (1 - share) * settings.far_flare_penalty + share * settings.sparse_far_flare_penalty
+    return weight * (added * far[..., None]).mean()
 
 
 def _ramp(progress: float) -> float:

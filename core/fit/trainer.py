@@ -76,7 +76,7 @@ class Trainer(FlareTrainer):
         super().__init__(settings)
         self.fits_scene = not settings.scene.frozen
         self._excess_ratio = MAX_EXCESS_RATIO
-        """`parallax_losses.excess_ratio` of the scene when its flare starts, in a fit by parallax."""
+        """`parallax_losses.excess_ratio` of the scene after the passes that fit it alone, in a fit by parallax."""
 
         # Inputs. Exposures are measured on the frames, and belong to the cameras of all that follows.
         self.frames = Frames(capture, settings.width, display_white=settings.display_white,
@@ -103,7 +103,6 @@ class Trainer(FlareTrainer):
                          *(() if self.flare is None else moved_light_warnings(capture, self.flare)))
         self._inputs = FitInputs(capture, clean_frames=self.frames.clean_source == "removed",
                                  lights=self.flare is not None)
-        self._scene_only_iterations = scene_only_iterations(settings.split, len(self.views), settings.iterations)
 
         # Moved before the optimisers take the parameters.
         self._device_frames = DeviceFrames(self.frames, self.device)
@@ -242,6 +241,13 @@ class Trainer(FlareTrainer):
         return clip_straight_through(scene, self.frames.display_white) if self.exposures else scene
 
     @property
+    def _scene_only_iterations(self) -> int:
+        """Number of iterations, from the first, in which a fit by parallax fits the scene alone; more once an excess
+        ratio was measured that demands it."""
+        return scene_only_iterations(self.settings.split, len(self.views), self.settings.iterations,
+                                     self._excess_ratio)
+
+    @property
     def _steps_in_backward(self) -> bool:
         """Return whether all gradients of the scene come from one rendering and the visibilities of the lights, so that
         the backward pass may take the optimiser's step."""
@@ -260,9 +266,10 @@ class Trainer(FlareTrainer):
 
     @torch.no_grad()
     def _measure_excess_ratio(self) -> None:
-        """In a fit by parallax, in the iteration in which the flare starts, measure `_excess_ratio`, which tells
-        whether the scene has converged; else do nothing."""
-        if not self.settings.uses_parallax or not 1 <= self._scene_only_iterations == self.iteration - 1:
+        """In a fit by parallax, after the passes over the views that fit the scene alone, measure `_excess_ratio`,
+        which tells whether the scene has converged; else do nothing."""
+        passes = scene_only_iterations(self.settings.split, len(self.views), self.settings.iterations)
+        if not self.settings.uses_parallax or not 1 <= passes == self.iteration - 1:
             return
 
         def residual(view: View) -> Tensor:
@@ -406,7 +413,7 @@ class Trainer(FlareTrainer):
         added = composite(behind, flare, settings.blend, self.frames.display_white) - behind
         estimated_flare = None if targets.clean is None else targets.frame - targets.clean
         return loss + far_flare_penalty(added, estimated_flare, self._excess_ratio, targets.camera, lights,
-                                        settings.split)
+                                        settings.split, len(self.views))
 
     @property
     def _opacity_floor(self) -> float:

@@ -34,6 +34,7 @@ from core.fit.parallax_losses import (
     light_proximity,
     quantile_loss,
     scene_loss,
+    scene_only_iterations,
 )
 from core.fit.rendering import render_flare
 from core.fit.settings import SplitSettings
@@ -266,7 +267,7 @@ def test_far_flare_light_falls_where_the_scene_has_not_converged(capture: Captur
 
         found: ratio at which the scene counts as converged.
         """
-        settings = override_settings(quick(120), {"mode": "split", "split.scene_only_rounds": 1,
+        settings = override_settings(quick(120), {"mode": "split", "split.scene_only_rounds": 1, "split.few_views": 0,
                                                   "split.converged_ratio": found, "split.far_flare_penalty": 3.0})
         trainer = Trainer(capture, settings)
         for _ in range(len(trainer.views) + 5):
@@ -290,7 +291,7 @@ def test_the_far_flare_penalty_grows_with_light_and_distance(capture: Capture) -
     camera, lights = capture.views[0].camera, np.array([light.xyz for light in capture.lights])
     added = torch.full((camera.height, camera.width, 3), 0.1, requires_grad=True)
     settings = SplitSettings(far_flare_penalty=2.0, light_radius=0.05)
-    loss = far_flare_penalty(added, None, 0.0, camera, lights, settings)
+    loss = far_flare_penalty(added, None, 0.0, camera, lights, settings, views=60)
     far = torch.from_numpy(1 - light_proximity(camera, lights, 0.05))
     assert float(loss.detach()) == pytest.approx(2 * 0.1 * float(far.mean()), rel=1e-4)
     loss.backward()
@@ -307,8 +308,37 @@ def test_the_far_flare_penalty_exempts_more_of_an_estimate_the_nearer_convergenc
     settings = SplitSettings(far_flare_penalty=2.0, diverged_ratio=10.0, converged_ratio=20.0)
     far = torch.from_numpy(1 - light_proximity(camera, lights, settings.light_radius))
     expected = 2 * ((0.1 - believed * estimated_flare.clamp(min=0)).clamp(min=0) * far[..., None]).mean()
-    penalty = far_flare_penalty(added, estimated_flare, found, camera, lights, settings)
+    penalty = far_flare_penalty(added, estimated_flare, found, camera, lights, settings, views=60)
     assert float(penalty) == pytest.approx(float(expected), rel=1e-4)
+
+
+def test_few_views_of_a_scene_that_has_not_converged_are_ambiguous(capture: Capture) -> None:
+    settings = SplitSettings(scene_only_rounds=2, few_views=30, far_flare_penalty=1.0, sparse_far_flare_penalty=3.0,
+                             diverged_ratio=10.0, converged_ratio=20.0)
+    assert [scene_only_iterations(settings, views, 750, 5.0) for views in (1, 9, 15, 30, 60, 500)] == [
+        250, 250, 250, 60, 120, 250]
+    assert scene_only_iterations(settings, 20, 750, 5.0) == 40 + (250 - 40) // 2, "half as sparse as 15 views"
+    assert scene_only_iterations(settings, 9, 750, 15.0) == 18 + (250 - 18) // 2, "half as far from convergence"
+    assert scene_only_iterations(settings, 9, 750, 20.0) == scene_only_iterations(settings, 9, 750) == 18
+    camera, lights = capture.views[0].camera, np.array([light.xyz for light in capture.lights])
+    added = torch.full((camera.height, camera.width, 3), 0.1)
+    sparse, half, dense = (float(far_flare_penalty(added, None, 0.0, camera, lights, settings, views))
+                           for views in (9, 20, 60))
+    assert sparse == pytest.approx(3 * dense) and half == pytest.approx(2 * dense)
+
+
+@pytest.mark.parametrize(("ratio", "iterations"), [(0.0, 40), (MAX_EXCESS_RATIO, 9)])
+def test_the_flare_of_a_sparse_capture_starts_later_unless_the_scene_has_converged(
+        capture: Capture, monkeypatch: pytest.MonkeyPatch, ratio: float, iterations: int) -> None:
+    monkeypatch.setattr("core.fit.trainer.excess_ratio", lambda _residuals: ratio)
+    settings = override_settings(quick(120), {"mode": "split", "split.scene_only_rounds": 1})
+    trainer = Trainer(capture, settings)
+    assert len(trainer.views) == 9
+    first = next(count for count in range(120) if "loss" in trainer.step())
+    assert first == iterations
+    resumed = Trainer(capture, settings)
+    resumed.load_state(trainer.state())
+    assert resumed._scene_only_iterations == iterations
 
 
 def test_ambiguous_light_goes_to_the_flare_but_a_light_disc_to_the_scene(capture: Capture) -> None:
@@ -636,7 +666,8 @@ def test_a_view_that_the_light_passes_leaves_other_views_unchanged(capture: Capt
 
 def test_a_scene_only_iteration_has_no_composite_loss(tmp_path: Path) -> None:
     """The loss is absent, since a loss of 0 would pass for a perfect fit."""
-    trainer = Trainer(Capture.open(flared_capture(tmp_path / "c", 5)), quick(120, mode="split"))
+    settings = quick(120, mode="split", **{"split.few_views": 0})
+    trainer = Trainer(Capture.open(flared_capture(tmp_path / "c", 5)), settings)
     figures_of_steps = [trainer.step() for _ in range(trainer._scene_only_iterations + 1)]
     assert all("loss" not in figures and figures["scene_loss"] > 0 for figures in figures_of_steps[:-1])
     assert figures_of_steps[-1]["loss"] > 0
@@ -645,7 +676,7 @@ def test_a_scene_only_iteration_has_no_composite_loss(tmp_path: Path) -> None:
 @pytest.mark.parametrize("converged", [True, False])
 def test_checkpoints_of_older_formats_restore_the_excess_ratio(capture: Capture, converged: bool) -> None:
     """The oldest hold the last scene-only iteration, later ones whether the scene converged, then `times_found`."""
-    settings = override_settings(quick(120), {"mode": "split", "split.scene_only_rounds": 1})
+    settings = override_settings(quick(120), {"mode": "split", "split.scene_only_rounds": 1, "split.few_views": 0})
     earlier, trainer = (Trainer(capture, settings) for _ in range(2))
     state = earlier.state()
     del state["excess_ratio"]

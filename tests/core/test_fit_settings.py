@@ -27,6 +27,14 @@ def test_a_config_is_read_as_it_was_written(tmp_path: Path, name: Any, model: An
     assert read_config(tmp_path / "config.toml") == settings
 
 
+def test_a_run_from_before_sparse_captures_keeps_its_schedule(tmp_path: Path) -> None:
+    path = tmp_path / "config.toml"
+    write_config(path, preset("draft", mode="split"))
+    lines = path.read_text(encoding="utf-8").splitlines()
+    path.write_text("\n".join(line for line in lines if not line.startswith("few_views")), encoding="utf-8")
+    assert read_config(path).split.few_views == 0
+
+
 def test_a_config_with_a_retired_setting_opens(tmp_path: Path) -> None:
     path = tmp_path / "config.toml"
     write_config(path, preset("draft", mode="split"))

@@ -35,6 +35,7 @@ from .light_results import (
 from .optimisers import Optimisers
 from .rendering import RenderedView, Scene, render
 from .settings import FitSettings
+from .warnings import outlier_warnings
 
 
 class FlareTrainer(abc.ABC):
@@ -106,6 +107,11 @@ class FlareTrainer(abc.ABC):
         self.flare = select_lights(self.flare, flaring)
         write_frame_lights(folder / FRAME_LIGHTS, self.capture, self.flare)
         return share_messages(shares, flaring)
+
+    def final_warnings(self) -> tuple[str, ...]:
+        """Return sentences for the user on what is doubtful after the last iteration."""
+        every_view_used = len(self.losses) == len(self.views)
+        return outlier_warnings(self.losses, self.settings.uses_plates) if every_view_used else ()
 
     def _pick_view(self) -> View:
         """Return the view of this iteration: each view once per round, in a random order that depends on seed and

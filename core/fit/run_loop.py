@@ -32,7 +32,6 @@ from .preview import preview_row, spread_indices, write_preview, write_small_pre
 from .run import Run
 from .settings import FitSettings
 from .trainer import Trainer
-from .warnings import outlier_warnings
 
 METRICS_INTERVAL = 50
 PREVIEW_ROWS = 4
@@ -101,8 +100,7 @@ def _run_to_end(trainer: FlareTrainer, run: Run, progress: Progress) -> None:
             _log(run, f"stopped at iteration {trainer.iteration}")
             raise
         _finish(trainer, run, progress)
-    if len(trainer.losses) == len(trainer.views):  # every view was used
-        _report(outlier_warnings(trainer.losses, trainer.settings.uses_plates), run, progress)
+    _report(trainer.final_warnings(), run, progress)
     _log(run, f"finished at iteration {trainer.iteration}")
 
 

@@ -51,7 +51,7 @@ from .parallax_losses import (
 )
 from .rendering import render_flare, render_scene
 from .settings import FitSettings
-from .warnings import footage_warnings, moved_light_warnings
+from .warnings import ambiguity_warnings, footage_warnings, moved_light_warnings
 
 CLEAR_INTERVAL = 50
 """Iterations between two updates of the lights' clear visibility (`visibility.clear_visibilities`)."""
@@ -132,6 +132,13 @@ class Trainer(FlareTrainer):
         if not self.settings.scene.frozen:
             self._scene.pixel_grid = pixel_grid
         write_ply(folder / SCENE, self._scene)
+
+    def final_warnings(self) -> tuple[str, ...]:
+        """Return the warnings of any fit, and one where parallax hardly decides between scene and flare."""
+        warnings = super().final_warnings()
+        if not self.settings.uses_parallax:
+            return warnings
+        return warnings + ambiguity_warnings(self.settings.split, len(self.views), self._excess_ratio)
 
     # ---- one iteration ----------------------------------------------------------------------------
 

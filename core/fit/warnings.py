@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Warnings on footage that a flare can hardly be learned from, on outlier frames, and on lights that were moved.
 
-`trainer` collects them before a fit, `run_loop` adds those after it.
+`trainer` collects those before a fit and those after it; `run_loop` reports them.
 """
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from ..capture import Capture, View
 from ..colour.srgb import LUMINANCE, linear_from_srgb
 from ..flare.model import FlareModel
 from .frames import Frames, subsample
-from .settings import FitSettings
+from .parallax_losses import ambiguity
+from .settings import FitSettings, SplitSettings
 
 MIN_VIEWS = 12
 """Views below which a fit warns: with 6 the sample's flare reaches 28.8 dB, with 50 33.6."""
@@ -60,6 +61,14 @@ def footage_warnings(capture: Capture, settings: FitSettings, views: Sequence[Vi
                             "frames that are far brighter or darker are fitted badly. Change the files' exposure "
                             "first.")
     return tuple(warnings)
+
+
+def ambiguity_warnings(settings: SplitSettings, views: int, ratio: float) -> tuple[str, ...]:
+    """Return a sentence if the `ambiguity` of a capture was above 0 when its flare was to start; else ()."""
+    if ambiguity(settings, views, ratio) == 0:
+        return ()
+    return (f"{views} frames hardly tell scene and flare apart here, so the flare has only what is near the lights or "
+            "bright: check preview.png. More frames, or clean frames in removed/, give a better flare.",)
 
 
 def outlier_warnings(losses: Mapping[str, float], uses_plates: bool = False) -> tuple[str, ...]:

@@ -336,6 +336,7 @@ def test_the_flare_of_a_sparse_capture_starts_later_unless_the_scene_has_converg
     assert len(trainer.views) == 9
     first = next(count for count in range(120) if "loss" in trainer.step())
     assert first == iterations
+    assert any("hardly tell" in text for text in trainer.final_warnings()) == (ratio == 0)
     resumed = Trainer(capture, settings)
     resumed.load_state(trainer.state())
     assert resumed._scene_only_iterations == iterations

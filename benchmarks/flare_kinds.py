@@ -3,8 +3,8 @@
 
 RUN is a fit of the sample capture NAME, whose flare is traced kind by kind: ghosts, starburst, glow, rings, streaks.
 The squared error of the linear flare, without clipped pixels, is shared out in each pixel of the held-out views by the
-light of each kind there. Ghosts are divided into their edges and their faces, starburst and glow into their core and what
-lies beyond. Prints a table for Markdown.
+light of each kind there. Ghosts are divided into their edges and their faces, starburst and glow into their core and
+what lies beyond. Prints a table for Markdown.
 """
 from __future__ import annotations
 

@@ -89,23 +89,19 @@ def estimate_loss(scene: Tensor, estimate: Tensor, ssim_share: float, progress: 
 
 
 def far_flare_penalty(added: Tensor, estimated_flare: Tensor | None, ratio: float, camera: Camera, lights: ArrayLike,
-                      settings: SplitSettings, views: int) -> Tensor:
+                      settings: SplitSettings) -> Tensor:
     """Return the penalty on `added`, the light that a flare adds, far from the lights (n, 3), world.
 
     added: (height, width, 3), display values. The penalty is for a scene that has not converged. Missing a ghost costs
     more than this penalty, so ghosts, which the scene cannot reproduce, stay in the flare; other light moves to the
     scene. estimated_flare: frame minus estimated clean frame, or None. ratio: the scene's `excess_ratio`; from
     `settings.diverged_ratio` to `settings.converged_ratio` the exempt share of the estimated flare rises from 0 to 1.
-    views: number of training views. The weight rises with the capture's `ambiguity` from `settings.far_flare_penalty`
-    to `settings.sparse_far_flare_penalty`.
     """
     if estimated_flare is not None:
         exempt_share = 1 - divergence(settings, ratio)
         added = (added - exempt_share * estimated_flare.clamp(min=0)).clamp(min=0)
     far = torch.from_numpy(1 - light_proximity(camera, lights, settings.light_radius)).to(added.device)
-    share = ambiguity(settings, views, ratio)
-    weight = (1 - share) * settings.far_flare_penalty + share * settings.sparse_far_flare_penalty
-    return weight * (added * far[..., None]).mean()
+    return settings.far_flare_penalty * (added * far[..., None]).mean()
 
 
 def _ramp(progress: float) -> float:

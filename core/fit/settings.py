@@ -146,12 +146,11 @@ class SplitSettings:
     only.
 
     If such a capture also has few training views, less than `few_views` and most from half of them down, its scene is
-    fitted alone for longer, up to a third of the iterations, and flare far from the lights costs more, up to
-    `sparse_far_flare_penalty`.
+    fitted alone for longer, up to a third of the iterations.
 
-    Mode `estimated`: until the middle of the fit the scene is also fitted to the estimated clean frames, with a falling
-    weight; the flare that these still hold is removed by parallax. Of the flare that they show, nothing is penalised
-    just below `converged_ratio`, and all of it at `diverged_ratio` and below.
+    Mode `estimated`: after these passes, and until the middle of the fit, the scene is also fitted to the estimated
+    clean frames, with a falling weight; the flare that these still hold is removed by parallax. Of the flare that they
+    show, nothing is penalised just below `converged_ratio`, and all of it at `diverged_ratio` and below.
     """
 
     scene_only_rounds: int = 2
@@ -168,7 +167,6 @@ class SplitSettings:
     diverged_ratio: float = 18.0
     far_flare_penalty: float = 0.1
     few_views: int = 30
-    sparse_far_flare_penalty: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -342,8 +340,7 @@ BOUNDS: dict[str, Bounds] = {
     "split.scene_only_rounds": _FROM_0, "split.few_views": _FROM_0, "split.excess_weight": _UNIT,
     "split.light_radius": Bounds(1e-6, 1e6),
     **dict.fromkeys((f"split.{name}" for name in (
-        "converged_ratio", "diverged_ratio", "far_flare_penalty", "sparse_far_flare_penalty", "scene_weight",
-        "near_scene_penalty")),
+        "converged_ratio", "diverged_ratio", "far_flare_penalty", "scene_weight", "near_scene_penalty")),
         _NON_NEGATIVE),
     "split.opacity_floor": Bounds(0, 1, exclusive_maximum=True),
     "split.low_sh_until": _UNIT, "split.final_near_share": _UNIT, "split.sh_degree": Bounds(0, 3),

@@ -248,6 +248,11 @@ class Trainer(FlareTrainer):
         return clip_straight_through(scene, self.frames.display_white) if self.exposures else scene
 
     @property
+    def _passes(self) -> int:
+        """Number of iterations of the passes that fit the scene alone in every fit by parallax."""
+        return scene_only_iterations(self.settings.split, len(self.views), self.settings.iterations)
+
+    @property
     def _scene_only_iterations(self) -> int:
         """Number of iterations, from the first, in which a fit by parallax fits the scene alone; more once an excess
         ratio was measured that demands it."""
@@ -275,8 +280,7 @@ class Trainer(FlareTrainer):
     def _measure_excess_ratio(self) -> None:
         """In a fit by parallax, after the passes over the views that fit the scene alone, measure `_excess_ratio`,
         which tells whether the scene has converged; else do nothing."""
-        passes = scene_only_iterations(self.settings.split, len(self.views), self.settings.iterations)
-        if not self.settings.uses_parallax or not 1 <= passes == self.iteration - 1:
+        if not self.settings.uses_parallax or not 1 <= self._passes == self.iteration - 1:
             return
 
         def residual(view: View) -> Tensor:
@@ -407,10 +411,13 @@ class Trainer(FlareTrainer):
         width, 3). flare: splats of all lights, None without any. light_discs: mask (height, width) or None.
         """
         settings = self.settings
-        if self.flare is None or self._is_scene_only(targets):
-            return quantile_loss(scene, targets.frame, settings.split.excess_weight)
-        lights = self.flare.positions_in(targets.camera.frame).numpy()
         progress = self.iteration / settings.iterations
+        if self.flare is None or self._is_scene_only(targets):
+            loss = quantile_loss(scene, targets.frame, settings.split.excess_weight)
+            if targets.clean is not None and self.iteration > self._passes:
+                loss = loss + estimate_loss(scene, targets.clean, settings.ssim_share, progress)
+            return loss
+        lights = self.flare.positions_in(targets.camera.frame).numpy()
         loss = scene_loss(scene, targets, lights, light_discs, settings.split, progress)
         if targets.clean is not None:
             loss = loss + estimate_loss(scene, targets.clean, settings.ssim_share, progress)
@@ -420,7 +427,7 @@ class Trainer(FlareTrainer):
         added = composite(behind, flare, settings.blend, self.frames.display_white) - behind
         estimated_flare = None if targets.clean is None else targets.frame - targets.clean
         return loss + far_flare_penalty(added, estimated_flare, self._excess_ratio, targets.camera, lights,
-                                        settings.split, len(self.views))
+                                        settings.split)
 
     @property
     def _opacity_floor(self) -> float:

@@ -67,8 +67,8 @@ def ambiguity_warnings(settings: SplitSettings, views: int, ratio: float) -> tup
     """Return a sentence if the `ambiguity` of a capture was above 0 when its flare was to start; else ()."""
     if ambiguity(settings, views, ratio) == 0:
         return ()
-    return (f"{views} frames hardly tell scene and flare apart here, so the flare has only what is near the lights or "
-            "bright: check preview.png. More frames, or clean frames in removed/, give a better flare.",)
+    return (f"{views} frames hardly tell scene and flare apart here, so the flare may hold parts of the scene: check "
+            "preview.png. More frames, or clean frames in removed/, give a better flare.",)
 
 
 def outlier_warnings(losses: Mapping[str, float], uses_plates: bool = False) -> tuple[str, ...]:

@@ -227,9 +227,9 @@ def test_mode_split_separates_scene_and_flare_without_clean_frames(tmp_path: Pat
     shutil.copytree(capture.folder, bare, ignore=shutil.ignore_patterns("removed", "truth"))
 
     def found(mode: str) -> tuple[float, float]:
-        """Means of three seeds, between which fits this short and small differ by more than a dB."""
+        """Means of two seeds, between which fits this short and small differ by more than a dB."""
         fits = []
-        for seed in range(3):
+        for seed in range(2):
             settings = override_settings(quick(400), {"mode": mode, "flare.density.stop": 120, "seed": seed})
             fits.append(flare_psnr(fit(Capture.open(bare), settings, tmp_path / f"{mode} {seed}"), capture))
         return float(np.mean([one for one, _ in fits])), fits[0][1]
@@ -291,7 +291,7 @@ def test_the_far_flare_penalty_grows_with_light_and_distance(capture: Capture) -
     camera, lights = capture.views[0].camera, np.array([light.xyz for light in capture.lights])
     added = torch.full((camera.height, camera.width, 3), 0.1, requires_grad=True)
     settings = SplitSettings(far_flare_penalty=2.0, light_radius=0.05)
-    loss = far_flare_penalty(added, None, 0.0, camera, lights, settings, views=60)
+    loss = far_flare_penalty(added, None, 0.0, camera, lights, settings)
     far = torch.from_numpy(1 - light_proximity(camera, lights, 0.05))
     assert float(loss.detach()) == pytest.approx(2 * 0.1 * float(far.mean()), rel=1e-4)
     loss.backward()
@@ -308,23 +308,17 @@ def test_the_far_flare_penalty_exempts_more_of_an_estimate_the_nearer_convergenc
     settings = SplitSettings(far_flare_penalty=2.0, diverged_ratio=10.0, converged_ratio=20.0)
     far = torch.from_numpy(1 - light_proximity(camera, lights, settings.light_radius))
     expected = 2 * ((0.1 - believed * estimated_flare.clamp(min=0)).clamp(min=0) * far[..., None]).mean()
-    penalty = far_flare_penalty(added, estimated_flare, found, camera, lights, settings, views=60)
+    penalty = far_flare_penalty(added, estimated_flare, found, camera, lights, settings)
     assert float(penalty) == pytest.approx(float(expected), rel=1e-4)
 
 
-def test_few_views_of_a_scene_that_has_not_converged_are_ambiguous(capture: Capture) -> None:
-    settings = SplitSettings(scene_only_rounds=2, few_views=30, far_flare_penalty=1.0, sparse_far_flare_penalty=3.0,
-                             diverged_ratio=10.0, converged_ratio=20.0)
+def test_the_scene_of_few_views_that_has_not_converged_is_fitted_alone_for_longer() -> None:
+    settings = SplitSettings(scene_only_rounds=2, few_views=30, diverged_ratio=10.0, converged_ratio=20.0)
     assert [scene_only_iterations(settings, views, 750, 5.0) for views in (1, 9, 15, 30, 60, 500)] == [
         250, 250, 250, 60, 120, 250]
     assert scene_only_iterations(settings, 20, 750, 5.0) == 40 + (250 - 40) // 2, "half as sparse as 15 views"
     assert scene_only_iterations(settings, 9, 750, 15.0) == 18 + (250 - 18) // 2, "half as far from convergence"
     assert scene_only_iterations(settings, 9, 750, 20.0) == scene_only_iterations(settings, 9, 750) == 18
-    camera, lights = capture.views[0].camera, np.array([light.xyz for light in capture.lights])
-    added = torch.full((camera.height, camera.width, 3), 0.1)
-    sparse, half, dense = (float(far_flare_penalty(added, None, 0.0, camera, lights, settings, views))
-                           for views in (9, 20, 60))
-    assert sparse == pytest.approx(3 * dense) and half == pytest.approx(2 * dense)
 
 
 @pytest.mark.parametrize(("ratio", "iterations"), [(0.0, 40), (MAX_EXCESS_RATIO, 9)])

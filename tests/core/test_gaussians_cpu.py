@@ -223,7 +223,11 @@ RENDER = SCENE + """
 @pytest.mark.skipif(sys.platform == "darwin" or os.uname().machine != "x86_64", reason="instruction sets of x86-64")
 def test_all_instruction_sets_give_the_same_picture(tmp_path: Path) -> None:
     pictures = []
-    for name in ("", "haswell", "nehalem"):  # this machine's own; AVX2; SSE 4.2
+    import llvmlite.binding as llvm
+
+    has_more_than_avx2 = llvm.get_host_cpu_features().get("avx512f", False)
+    # This machine's own; AVX2, if that is another; SSE 4.2. Each is compiled anew.
+    for name in ("", "haswell", "nehalem") if has_more_than_avx2 else ("", "nehalem"):
         where = tmp_path / f"{name}.npy"
         environment = {**os.environ, **({"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": ""} if name else {})}
         subprocess.run(

@@ -12,21 +12,21 @@ import argparse
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from core.capture import Camera, View
+from benchmarks.hidden_lights import SHARES
+from core.capture import Camera
+from core.capture.discs import squared_light_distances
 from core.errors import CaptureError
 from core.fit.run import Run
-from core.images.read import read_picture
 from core.metrics.evaluation import unscored_mask
 from core.optics.flare import LensSetup, render_flare
 from core.system.files import read_json
-from sample_scenes.description import LightSource
+from sample_scenes.description import LightSource, SceneDescription
 from sample_scenes.flares import LENS_SETUPS
 from sample_scenes.scenes import SCENES
 
@@ -36,13 +36,13 @@ CORE = 0.02
 """Radius of the core of starburst and glow, share of the frame's width."""
 EDGE = 0.25
 """A ghost's pixel lies on an edge where the light changes, over one pixel, by more than this share of its own."""
-OFF_STARBURST, OFF_GLOW = {"gain": 0.0}, {"gain": 0.0, "wide_gain": 0.0, "floor": 0.0}
 
 
 def kinds_of(setup: LensSetup) -> dict[str, LensSetup]:
     """Return a setup for each kind of light, which draws that kind alone; kinds that the lens lacks are left out."""
     nothing = replace(setup, ghosts=replace(setup.ghosts, gain=0.0), rings=(), streaks=(),
-                      starburst=replace(setup.starburst, **OFF_STARBURST), glow=replace(setup.glow, **OFF_GLOW))
+                      starburst=replace(setup.starburst, gain=0.0),
+                      glow=replace(setup.glow, gain=0.0, wide_gain=0.0, floor=0.0))
     kinds = {"ghosts": replace(nothing, ghosts=setup.ghosts), "starburst": replace(nothing, starburst=setup.starburst),
              "glow": replace(nothing, glow=setup.glow), "rings": replace(nothing, rings=setup.rings),
              "streaks": replace(nothing, streaks=setup.streaks)}
@@ -50,64 +50,62 @@ def kinds_of(setup: LensSetup) -> dict[str, LensSetup]:
 
 
 def draw_kinds(setup: LensSetup, camera: Camera, lights: tuple[LightSource, ...], shares: dict[str, float]
-               ) -> tuple[dict[str, Layer], Layer]:
-    """Return the light of each kind, (height, width), the mean of the channels, and the distance of each pixel to the
-    nearest light, shares of the frame's width.
+               ) -> dict[str, Layer]:
+    """Return the light of each kind, (height, width), the mean of the channels.
 
     shares: visible share of each light, by name.
     """
-    size = camera.height, camera.width
-    layers = {name: np.zeros(size) for name in kinds_of(setup)}
-    distance = np.full(size, np.inf)
-    v, u = np.mgrid[:camera.height, :camera.width] + 0.5
+    layers = {name: np.zeros((camera.height, camera.width)) for name in kinds_of(setup)}
     for light in lights:
         position = camera.world_to_camera[:3, :3] @ np.array(light.xyz) + camera.world_to_camera[:3, 3]
         strength = light.flare_strength(float(np.linalg.norm(position)))
         for name, kind in kinds_of(setup).items():
             layers[name] += render_flare(kind, camera, position, colour=light.colour, intensity=strength,
                                          visible_share=shares[light.name]).mean(axis=2)
-        (pixel,), (depth,) = camera.project(np.array(light.xyz)[None])
-        if depth > 0:
-            distance = np.minimum(distance, np.hypot(u - pixel[0], v - pixel[1]) / camera.width)
-    return layers, distance
+    return layers
 
 
-def divide(layers: dict[str, Layer], distance: Layer) -> dict[str, Layer]:
-    """Return the light of each kind, with ghosts and starburst divided by place."""
-    near = distance < CORE
-    divided = {}
+def partition(layers: dict[str, Layer], near_light: NDArray[np.bool_]) -> dict[str, Layer]:
+    """Return the light of each kind, (height, width), with ghosts, starburst and glow partitioned by place.
+
+    near_light: (height, width), true in the core of starburst and glow.
+    """
+    parts = {}
     for name, layer in layers.items():
         if name == "ghosts":
             is_first = np.hypot(*np.gradient(layer)) > EDGE * np.maximum(layer, 1e-6)
             first, second = "ghosts, edges", "ghosts, faces"
         elif name in ("starburst", "glow"):
-            is_first, first, second = near, f"{name}, core", f"{name}, beyond"
+            is_first, first, second = near_light, f"{name}, core", f"{name}, beyond"
         else:
-            divided[name] = layer
+            parts[name] = layer
             continue
-        divided[first], divided[second] = layer * is_first, layer * ~is_first
-    return divided
+        parts[first], parts[second] = layer * is_first, layer * ~is_first
+    return parts
 
 
-def measure(run: Run, scene: Any) -> dict[str, tuple[float, float, float]]:
+def measure(run: Run, scene: SceneDescription) -> dict[str, tuple[float, float, float]]:
     """Return for each kind its share of the light, its share of the squared error, and the mean signed error relative
     to its light, over the held-out views."""
     capture = run.open_capture()
     _, held_out = capture.split(run.settings.holdout)
     setup = LENS_SETUPS[scene.lens]
-    shares = read_json(capture.folder / "truth" / "visible_share.json", CaptureError)
+    shares = read_json(capture.folder / SHARES, CaptureError)
     light: dict[str, float] = {}
     error: dict[str, float] = {}
     bias: dict[str, float] = {}
     for view in held_out:
-        camera = _camera_of(run, view)
-        truth = read_picture(capture.folder / "truth" / "flare" / f"{Path(view.name).stem}.exr")
-        exact = truth.resized(camera.width, camera.height).linear().astype(np.float64)
+        camera = view.camera.scaled(min(run.settings.width or view.camera.width, view.camera.width))
+        truth = capture.truth_flare(view, camera.size)
+        if truth is None:
+            raise CaptureError(f"{capture.folder} has no exact flare layers; make it with sample_scenes/render.py.")
+        exact = truth.linear().astype(np.float64)
         layers = run.render(camera).flare_by_light.values()
         fitted = sum((layer.astype(np.float64) for layer in layers), np.zeros_like(exact))
         scored = ~unscored_mask(capture, view, camera.size)
-        kinds, distance = draw_kinds(setup, camera, scene.lights, shares[view.name])
-        kinds = divide(kinds, distance)
+        lights = np.array([light.xyz for light in scene.lights])
+        kinds = partition(draw_kinds(setup, camera, scene.lights, shares[view.name]),
+                          squared_light_distances(camera, lights) < CORE**2)
         total = np.maximum(sum(kinds.values()), 1e-6)
         for name, layer in kinds.items():
             weight = layer / total * scored
@@ -117,11 +115,6 @@ def measure(run: Run, scene: Any) -> dict[str, tuple[float, float, float]]:
     all_light, all_error = sum(light.values()), sum(error.values())
     return {name: (light[name] / all_light, error[name] / all_error, bias[name] / max(light[name], 1e-9))
             for name in light}
-
-
-def _camera_of(run: Run, view: View) -> Camera:
-    """Return the camera of a view at the size of the fit."""
-    return view.camera.scaled(min(run.settings.width or view.camera.width, view.camera.width))
 
 
 def main() -> None:

@@ -142,9 +142,9 @@ class _Samples:
         inside, places = project_sphere(view.camera, view.camera.position, directions, 0.0)
         x, y = pixel_indices(places, view.camera.size)
         rows = np.flatnonzero(inside)
-        if view.counts is not None:
-            counts = view.counts[y, x]
-            rows, x, y = rows[counts], x[counts], y[counts]
+        if view.mask is not None:
+            unmasked = view.mask[y, x]
+            rows, x, y = rows[unmasked], x[unmasked], y[unmasked]
         return cls(rows, x, y, regions[y, x], view.picture[y, x])
 
     def read(self, mask: Booleans) -> Booleans:
@@ -158,8 +158,8 @@ def _light_seeds(view: SweepView, lights: Floats) -> list[_Seed]:
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     for (light_x, light_y), depth in zip(*camera.project(lights), strict=True):
         pixels = np.hypot(x - light_x, y - light_y) <= SEED_RADIUS * camera.width
-        if view.counts is not None:
-            pixels &= view.counts
+        if view.mask is not None:
+            pixels &= view.mask
         if depth > 0 and pixels.sum() >= MIN_SEED_PX:
             seeds.append(_Seed(pixels, float(np.median(view.picture.max(-1)[pixels]))))
     return seeds
@@ -193,8 +193,8 @@ def _segment_smooth_regions(view: SweepView, points: Values, level: float) -> ND
     is_smooth[:, :-1] &= ~steps_x
     is_smooth[1:] &= ~steps_y
     is_smooth[:-1] &= ~steps_y
-    if view.counts is not None:
-        is_smooth &= view.counts
+    if view.mask is not None:
+        is_smooth &= view.mask
     count, regions = cv2.connectedComponents(is_smooth.astype(np.uint8), connectivity=4)
     pixels, depth = view.camera.project(points)
     x, y = pixel_indices(pixels[view.camera.contains(pixels, depth)], view.camera.size)

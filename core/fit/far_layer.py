@@ -241,8 +241,8 @@ def _disagreement(views: list[SweepView], directions: Floats, inverse_radius: fl
         inside, places = project_sphere(view.camera, centre, directions, inverse_radius)
         x, y = pixel_indices(places, view.camera.size)
         row[inside] = bilinear(view.picture, places)
-        if view.counts is not None:
-            row[np.flatnonzero(inside)[~view.counts[y, x]]] = np.nan
+        if view.mask is not None:
+            row[np.flatnonzero(inside)[~view.mask[y, x]]] = np.nan
     view_counts = np.isfinite(values[..., 0]).sum(0)
     visible = view_counts >= MIN_VIEWS
     cost = np.zeros(len(directions))

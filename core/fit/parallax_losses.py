@@ -27,23 +27,23 @@ MAX_EXCESS_RATIO = 1e9
 """Largest `excess_ratio`, that of a scene that is nowhere brighter than the frames."""
 
 
-def divergence(settings: SplitSettings, ratio: float) -> float:
-    """Return how far a scene is from convergence, 0..1, by its `excess_ratio`.
+def convergence(settings: SplitSettings, ratio: float) -> float:
+    """Return how far a scene has converged, 0..1, by its `excess_ratio`.
 
-    0 from `settings.converged_ratio` on, 1 from `settings.diverged_ratio` down.
+    1 from `settings.converged_ratio` on, 0 from `settings.diverged_ratio` down.
     """
     span = max(settings.converged_ratio - settings.diverged_ratio, 1e-9)
-    return min(max((settings.converged_ratio - ratio) / span, 0.0), 1.0)
+    return min(max((ratio - settings.diverged_ratio) / span, 0.0), 1.0)
 
 
 def ambiguity(settings: SplitSettings, views: int, ratio: float) -> float:
     """Return how little the parallax of a capture decides between scene and flare, 0..1.
 
-    The `divergence` of its scene, times its sparsity: 0 from `settings.few_views` training views on, 1 from half of
-    them down.
+    What its scene lacks of `convergence`, times the sparsity of its views: 0 from `settings.few_views` training views
+    on, 1 from half of them down.
     """
     sparsity = min(max(settings.few_views / max(views, 1) - 1, 0.0), 1.0)
-    return sparsity * divergence(settings, ratio)
+    return sparsity * (1 - convergence(settings, ratio))
 
 
 def scene_only_iterations(settings: SplitSettings, views: int, iterations: int, ratio: float = MAX_EXCESS_RATIO) -> int:
@@ -98,8 +98,7 @@ def far_flare_penalty(added: Tensor, estimated_flare: Tensor | None, ratio: floa
     `settings.diverged_ratio` to `settings.converged_ratio` the exempt share of the estimated flare rises from 0 to 1.
     """
     if estimated_flare is not None:
-        exempt_share = 1 - divergence(settings, ratio)
-        added = (added - exempt_share * estimated_flare.clamp(min=0)).clamp(min=0)
+        added = (added - convergence(settings, ratio) * estimated_flare.clamp(min=0)).clamp(min=0)
     far = torch.from_numpy(1 - light_proximity(camera, lights, settings.light_radius)).to(added.device)
     return settings.far_flare_penalty * (added * far[..., None]).mean()
 

@@ -27,12 +27,15 @@ Booleans = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class SweepView:
-    """A view of the sweep: its small camera, its picture (height, width, 3), display values, and which pixels (height,
-    width) count, None for all."""
+    """A view of the sweep.
+
+    camera: small. picture: (height, width, 3), display values. mask: (height, width), true for pixels that count; None
+    for all.
+    """
 
     camera: Camera
     picture: Values
-    counts: Booleans | None
+    mask: Booleans | None
 
 
 def make_sweep_view(view: View, frames: Frames) -> SweepView:
@@ -42,12 +45,11 @@ def make_sweep_view(view: View, frames: Frames) -> SweepView:
     small = camera.scaled(min(SWEEP_WIDTH, camera.width))
     picture = expose(frame if clean is None else clean, 1 / camera.exposure).numpy()
     values = Picture(picture, "srgb").resized(*small.size).display()
-    mask = frames.mask(view)
-    counts = None
+    mask, small_mask = frames.mask(view), None
     if mask is not None:
         share = Picture(mask.numpy().astype(np.float32), "linear").resized(*small.size).pixels
-        counts = np.asarray(share > 0.99)  # a small pixel counts only if all pixels that it averages do
-    return SweepView(small, values, counts)
+        small_mask = np.asarray(share > 0.99)  # a small pixel counts only if all pixels that it averages do
+    return SweepView(small, values, small_mask)
 
 
 def visible_directions(cameras: list[Camera], pitch: float) -> Floats:

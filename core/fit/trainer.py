@@ -248,8 +248,8 @@ class Trainer(FlareTrainer):
         return clip_straight_through(scene, self.frames.display_white) if self.exposures else scene
 
     @property
-    def _passes(self) -> int:
-        """Number of iterations of the passes that fit the scene alone in every fit by parallax."""
+    def _min_scene_only_iterations(self) -> int:
+        """Number of iterations in which every fit by parallax fits the scene alone."""
         return scene_only_iterations(self.settings.split, len(self.views), self.settings.iterations)
 
     @property
@@ -280,7 +280,7 @@ class Trainer(FlareTrainer):
     def _measure_excess_ratio(self) -> None:
         """In a fit by parallax, after the passes over the views that fit the scene alone, measure `_excess_ratio`,
         which tells whether the scene has converged; else do nothing."""
-        if not self.settings.uses_parallax or not 1 <= self._passes == self.iteration - 1:
+        if not self.settings.uses_parallax or not 1 <= self._min_scene_only_iterations == self.iteration - 1:
             return
 
         def residual(view: View) -> Tensor:
@@ -414,7 +414,7 @@ class Trainer(FlareTrainer):
         progress = self.iteration / settings.iterations
         if self.flare is None or self._is_scene_only(targets):
             loss = quantile_loss(scene, targets.frame, settings.split.excess_weight)
-            if targets.clean is not None and self.iteration > self._passes:
+            if targets.clean is not None and self.iteration > self._min_scene_only_iterations:
                 loss = loss + estimate_loss(scene, targets.clean, settings.ssim_share, progress)
             return loss
         lights = self.flare.positions_in(targets.camera.frame).numpy()

@@ -40,7 +40,7 @@ MAX_STATIC_DISTANCE = 0.006
 class Findings:
     """The result of a search: lights, doubtful places, and the detections of each view.
 
-    lights: best supported first. doubtful: each with its doubt. messages: sentences for the user.
+    lights: best supported first. doubtful: each with the reason of its rejection. messages: sentences for the user.
     """
 
     lights: list[FoundLight]
@@ -79,7 +79,7 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
         lights, gaps = split_gaps(supported, dict(views), brightness_maps)
         lights, surfaces = split_surfaces(lights, dict(views), brightness_maps)
         unsupported = [light for light in candidates if not _is_well_supported(light, min_views, settings)]
-        doubtful = [replace(light, doubt=doubt) for doubt, places in
+        doubtful = [replace(light, rejection=reason) for reason, places in
                     (("gap", gaps), ("surface", surfaces), ("few views", unsupported)) for light in places]
         if gaps:
             messages.append(f"{len(gaps)} places are no lights but gaps through which a bright far surrounding shows.")
@@ -169,7 +169,7 @@ def write_findings(capture: Capture, findings: Findings, keep: bool = False, tra
         sheets = write_track_sheets(capture.folder / SHEETS, lit_capture, tracked.sources)
     report = {
         "lights": entries, "says": findings.messages,
-        "doubtful": [{"xyz": light.xyz.round(5).tolist(), "far": light.far, "doubt": light.doubt,
+        "doubtful": [{"xyz": light.xyz.round(5).tolist(), "far": light.far, "rejection": light.rejection,
                       "support": list(light.support), "residual_px": round(light.residual, 3),
                       "uncertainty": _round_finite(light.uncertainty)}
                      for light in findings.doubtful],

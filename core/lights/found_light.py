@@ -21,7 +21,7 @@ class FoundLight:
     uncertainty: one standard deviation, scene units along the worst direction; degrees of direction where far.
     nfa: number of false alarms, the expected number of lights of this support by chance.
     colour: (3,) linear, largest channel 1. radius: median of its detections, pixels. how: method that found it.
-    doubt: why it is left out, "gap", "surface" or "few views"; "" for a light.
+    rejection: reason why it is left out, "gap", "surface" or "few views"; "" for a light.
     """
 
     xyz: Floats
@@ -34,5 +34,5 @@ class FoundLight:
     radius: float
     nfa: float = 0.0
     how: str = "triangulated"
-    doubt: str = ""
+    rejection: str = ""
     detections: tuple[tuple[str, Detection], ...] = field(default=(), repr=False)

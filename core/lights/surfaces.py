@@ -24,16 +24,16 @@ REACH = 2.0
 MIN_SHAPES, MIN_SHAPE_RADIUS = 3, 2.5
 """Number of detections, whole within their frames, and radius of a light, pixels, from which shapes are compared: those
 of smaller discs differ by where the pixels fall."""
-RECURRENCE_QUANTILE = 2 / 3
+CONSISTENCY_QUANTILE = 2 / 3
 """Quantile of the overlaps: a lamp shows its whole shape in the rest of its detections, at least a third."""
-MIN_RECURRENCE = 0.55
+MIN_CONSISTENCY = 0.55
 """Recurrence of a light's shapes below which it is part of a surface."""
-MIN_SUPPORT_RATIO = 0.4
+MIN_DETECTION_RATE = 0.4
 """Share of detections among the views that show a light's place bright, below which it is part of a surface."""
-LARGE_RADIUS, MIN_LARGE_CONSTANCY = 0.018, 0.75
-"""Radius of a light, frame diagonals, from which it is large, and the least product of its recurrence and its support
-ratio: little hides much of it, and most large bright regions are surfaces."""
-MAX_DARK_SURROUND = 0.2
+LARGE_RADIUS, MIN_LARGE_CONFIDENCE = 0.018, 0.75
+"""Radius of a light, frame diagonals, from which it is large, and the least product of its consistency and its
+detection rate: little hides much of it, and most large bright regions are surfaces."""
+MIN_LAMP_SURROUND = 0.2
 """Median surround of a large light's detections, linear light, from which it is a lamp all the same: its glow or the
 wall that it lights is bright on all sides."""
 
@@ -52,11 +52,11 @@ def split_surfaces(lights: Sequence[FoundLight], cameras: Mapping[str, Camera],
     return lamps, surfaces
 
 
-def shape_recurrence(light: FoundLight, cameras: Mapping[str, Camera]) -> float | None:
+def shape_consistency(light: FoundLight, cameras: Mapping[str, Camera]) -> float | None:
     """Return how well the shapes of a light's detections recur, 0..1.
 
-    The overlap of two shapes is their intersection over their union. The recurrence of one shape is the quantile
-    RECURRENCE_QUANTILE of its overlaps with the others; that of the light is the same quantile over its shapes, since
+    The overlap of two shapes is their intersection over their union. The consistency of one shape is the quantile
+    CONSISTENCY_QUANTILE of its overlaps with the others; that of the light is the same quantile over its shapes, since
     something may hide a part of a lamp in most views. Detections that the frame's edge cuts have no shape. None if
     fewer than MIN_SHAPES have one, or if the light is smaller than MIN_SHAPE_RADIUS.
     """
@@ -70,10 +70,10 @@ def shape_recurrence(light: FoundLight, cameras: Mapping[str, Camera]) -> float 
     areas, intersections = shapes.sum(axis=1), shapes @ shapes.T
     overlaps = intersections / np.maximum(areas[:, None] + areas - intersections, 1)
     others = overlaps[~np.eye(len(whole), dtype=bool)].reshape(len(whole), -1)
-    return float(np.quantile(np.quantile(others, RECURRENCE_QUANTILE, axis=1), RECURRENCE_QUANTILE))
+    return float(np.quantile(np.quantile(others, CONSISTENCY_QUANTILE, axis=1), CONSISTENCY_QUANTILE))
 
 
-def support_ratio(light: FoundLight, cameras: Mapping[str, Camera], maps: Mapping[str, NDArray[np.bool_]]) -> float:
+def detection_rate(light: FoundLight, cameras: Mapping[str, Camera], maps: Mapping[str, NDArray[np.bool_]]) -> float:
     """Return the share of detections, 0..1, among the views that detect a light or show its place bright.
 
     cameras, maps: as for `split_surfaces`.
@@ -89,10 +89,10 @@ def support_ratio(light: FoundLight, cameras: Mapping[str, Camera], maps: Mappin
 def _is_surface(light: FoundLight, cameras: Mapping[str, Camera], maps: Mapping[str, NDArray[np.bool_]]) -> bool:
     diagonal = float(np.median([np.hypot(*camera.size) for camera in cameras.values()]))
     is_large = light.radius >= LARGE_RADIUS * diagonal
-    recurrence, ratio = shape_recurrence(light, cameras), support_ratio(light, cameras, maps)
-    if is_large and np.median([detection.surround for _, detection in light.detections]) < MAX_DARK_SURROUND:
-        return recurrence is None or recurrence * ratio < MIN_LARGE_CONSTANCY  # None: no view shows it whole
-    return ratio < MIN_SUPPORT_RATIO or (recurrence is not None and recurrence < MIN_RECURRENCE)
+    consistency, rate = shape_consistency(light, cameras), detection_rate(light, cameras, maps)
+    if is_large and np.median([detection.surround for _, detection in light.detections]) < MIN_LAMP_SURROUND:
+        return consistency is None or consistency * rate < MIN_LARGE_CONFIDENCE  # None: no view shows it whole
+    return rate < MIN_DETECTION_RATE or (consistency is not None and consistency < MIN_CONSISTENCY)
 
 
 def _depth(light: FoundLight, camera: Camera) -> float:

@@ -156,7 +156,7 @@ def _find_and_record(capture: Capture, detector: Detector, progress: Progress,
     for light in report["lights"]:
         progress.say(_describe_light(light))
     if findings.doubtful:
-        unsupported = sum(light.doubt == "few views" for light in findings.doubtful)
+        unsupported = sum(light.rejection == "few views" for light in findings.doubtful)
         progress.say(f"Left out as doubtful: {len(findings.doubtful)} places, {unsupported} of them since too few "
                      f"views show them. {capture.folder / SHEETS / REPORT} lists them; add them by hand where they are "
                      "lights.")

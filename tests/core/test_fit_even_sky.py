@@ -150,13 +150,12 @@ def test_a_region_that_covers_little_of_the_seed_is_no_sky() -> None:
         assert (mask & wall).sum() <= 0.05 * wall.sum()
 
 
-def test_masked_pixels_are_no_sky() -> None:
+def test_sky_segmentation_is_limited_to_the_mask() -> None:
     views = sweep(orbit(9, size=SIZE))
-    counts = np.ones(views[0].picture.shape[:2], bool)
-    counts[:, 60:] = False
-    masked = [replace(view, counts=counts) for view in views]
-    sky = segment_sky(masked, SUN[None], wall_points(), PITCH)
-    assert sky is not None and all(mask[:, :58].any() and not mask[:, 62:].any() for mask in sky.masks)
+    mask = np.ones(views[0].picture.shape[:2], bool)
+    mask[:, 60:] = False
+    sky = segment_sky([replace(view, mask=mask) for view in views], SUN[None], wall_points(), PITCH)
+    assert sky is not None and all(found[:, :58].any() and not found[:, 62:].any() for found in sky.masks)
 
 
 def test_a_lamp_that_shows_no_parallax_is_not_far_if_it_is_no_farther_than_the_room() -> None:

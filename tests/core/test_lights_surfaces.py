@@ -15,7 +15,7 @@ from core.images.picture import Picture
 from core.lights import Detection, find_lights
 from core.lights.detection import measure_detection
 from core.lights.found_light import FoundLight
-from core.lights.surfaces import shape_recurrence, split_surfaces, support_ratio
+from core.lights.surfaces import detection_rate, shape_consistency, split_surfaces
 from tests.core.captures import make_capture, orbit
 
 SIZE = (320, 240)
@@ -69,8 +69,8 @@ def is_lamp(light: FoundLight, cameras: dict[str, Camera], maps: dict[str, NDArr
 
 def test_a_lamp_shows_one_shape_and_a_window_behind_bars_many(cameras: dict[str, Camera]) -> None:
     lamp = light_of({name: disc(camera, RADIUS) for name, camera in cameras.items()})
-    recurrence = shape_recurrence(lamp, cameras)
-    assert recurrence is not None and recurrence > 0.7 and is_lamp(lamp, cameras, dark(cameras))
+    consistency = shape_consistency(lamp, cameras)
+    assert consistency is not None and consistency > 0.7 and is_lamp(lamp, cameras, dark(cameras))
     masks = [stripe(disc(camera, 2 * RADIUS), number) for number, camera in enumerate(cameras.values())]
     window = light_of(dict(zip(cameras, masks, strict=True)))
     assert not is_lamp(window, cameras, dark(cameras))
@@ -80,7 +80,7 @@ def test_a_lamp_shows_one_shape_and_a_window_behind_bars_many(cameras: dict[str,
 def test_a_disc_of_a_few_pixels_has_no_shape(cameras: dict[str, Camera]) -> None:
     masks = {name: stripe(disc(camera, 0.7 * RADIUS), number) for number, (name, camera) in enumerate(cameras.items())}
     spot = light_of(masks)
-    assert spot.radius < 2.5 and shape_recurrence(spot, cameras) is None and is_lamp(spot, cameras, dark(cameras))
+    assert spot.radius < 2.5 and shape_consistency(spot, cameras) is None and is_lamp(spot, cameras, dark(cameras))
 
 
 def test_a_lamp_that_is_hidden_in_part_in_some_views_stays(cameras: dict[str, Camera]) -> None:
@@ -101,7 +101,7 @@ def test_a_large_surface_is_bright_where_it_is_not_detected(cameras: dict[str, C
     small = light_of({name: disc(camera, 0.5 * RADIUS) for name, camera in list(cameras.items())[:6]})
     assert is_lamp(small, cameras, masks), "a small lamp before a wall is missed in some views"
     rare = light_of({name: disc(camera, 0.5 * RADIUS) for name, camera in list(cameras.items())[:3]})
-    assert support_ratio(rare, cameras, masks) == pytest.approx(1 / 3)
+    assert detection_rate(rare, cameras, masks) == pytest.approx(1 / 3)
     assert not is_lamp(rare, cameras, masks), "what most views show bright without a spot is a wall"
 
 
@@ -113,7 +113,7 @@ def test_a_large_light_needs_views_that_show_it_whole(cameras: dict[str, Camera]
 
     assert not is_lamp(cut(2 * RADIUS), cameras, dark(cameras))
     assert is_lamp(cut(0.5 * RADIUS), cameras, dark(cameras))
-    assert shape_recurrence(cut(RADIUS), cameras) is None
+    assert shape_consistency(cut(RADIUS), cameras) is None
 
 
 class Fixed:
@@ -135,7 +135,7 @@ def test_the_search_reports_surfaces_as_doubtful(tmp_path: Path, cameras: dict[s
         cv2.imwrite(str(folder / "images" / name), np.where(masks[name], 255, 40).astype(np.uint8))
     findings = find_lights(Capture.open(folder), Fixed(light_of(masks)))
     assert len(findings.lights) == lamp
-    assert [light.doubt for light in findings.doubtful] == ([] if lamp else ["surface"])
+    assert [light.rejection for light in findings.doubtful] == ([] if lamp else ["surface"])
     assert any("surfaces" in message for message in findings.messages) != lamp
 
 
